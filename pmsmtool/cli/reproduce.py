@@ -14,6 +14,7 @@ from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
     from pmsmtool.papers.figure import Reproduction
+    from pmsmtool.papers.registry import Row
 
 _SEED = WholeNumber("seed", 0, 2**32 - 1)
 _SUFFIXES = (".json", ".csv", ".txt")
@@ -64,10 +65,10 @@ def reproduce_command(
     for row in rows:
         out.status(f"{row.name} (about {row.run_s:g} s)")
         found = reproduce(row.name, seed)
-        _write(found, path, figure_path, out)
-        data.append(_data(found))
+        _write(row, found, path, figure_path, out)
+        data.append(_data(row, found))
         if not out.json:
-            out.result("reproduce", {}, (*_text(found), *([""] if len(rows) > 1 else [])))
+            out.result("reproduce", {}, (*_text(row, found), *([""] if len(rows) > 1 else [])))
         outside += [f"{row.name}: {check.what}" for check in found.checks if not check.within]
     if out.json:
         out.json_line("reproduce", {"figures": data} if figure == "all" else data[0])
@@ -98,10 +99,10 @@ def _list(out: Output) -> None:
     out.result("reproduce", {"figures": rows}, table(("figure", "shows", "s", "source"), shown))
 
 
-def _data(found: Reproduction) -> dict[str, Any]:
+def _data(row: Row, found: Reproduction) -> dict[str, Any]:
     return {
-        "name": found.name,
-        "title": found.title,
+        "name": row.name,
+        "title": row.title,
         "source": found.source,
         "ok": found.good,
         "checks": [
@@ -126,10 +127,10 @@ def _series(found: Reproduction) -> list[Mapping[str, Any]]:
     ]  # fmt: skip
 
 
-def _text(found: Reproduction) -> Iterator[str]:
+def _text(row: Row, found: Reproduction) -> Iterator[str]:
     from pmsmtool.papers.drawing import tables_of
 
-    yield f"{found.name}: {found.title}"
+    yield f"{row.name}: {row.title}"
     yield found.source
     for shown in tables_of(found):
         yield ""
@@ -140,7 +141,7 @@ def _text(found: Reproduction) -> Iterator[str]:
         yield from (f"note: {note}" for note in found.notes)
 
 
-def _write(found: Reproduction, path: Path | None, figure_path: Path | None, out: Output) -> None:
+def _write(row: Row, found: Reproduction, path: Path | None, figure_path: Path | None, out: Output) -> None:
     from pmsmtool.cli.output import save_figure
     from pmsmtool.files import make_folder, write_file
     from pmsmtool.papers.drawing import csv_text, figure_of
@@ -150,26 +151,26 @@ def _write(found: Reproduction, path: Path | None, figure_path: Path | None, out
         targets = [path]
     elif path is not None:
         make_folder(path)
-        targets = [path / f"{found.name}{suffix}" for suffix in _SUFFIXES]
+        targets = [path / f"{row.name}{suffix}" for suffix in _SUFFIXES]
         if found.panels:
-            save_figure(figure_of(found), path / f"{found.name}.svg")
-            out.note(f"wrote {path / found.name}.svg")
+            save_figure(figure_of(found, row.title), path / f"{row.name}.svg")
+            out.note(f"wrote {path / row.name}.svg")
     for target in targets:
-        write_file(target, _content(found, target.suffix.lower(), csv_text))
+        write_file(target, _content(row, found, target.suffix.lower(), csv_text))
         out.note(f"wrote {target}")
     if figure_path is not None:
-        save_figure(figure_of(found), figure_path)
+        save_figure(figure_of(found, row.title), figure_path)
         out.note(f"wrote {figure_path}")
 
 
-def _content(found: Reproduction, suffix: str, csv_text: Any) -> str:
+def _content(row: Row, found: Reproduction, suffix: str, csv_text: Any) -> str:
     if suffix == ".csv":
         return str(csv_text(found))
     if suffix == ".txt":
-        return "\n".join((*_text(found), ""))
+        return "\n".join((*_text(row, found), ""))
     import json
 
     from pmsmtool.plain_text import jsonable
 
-    content = {"schema": "pmsmtool.reproduce/1", **_data(found), "panels": _series(found)}
+    content = {"schema": "pmsmtool.reproduce/1", **_data(row, found), "panels": _series(found)}
     return json.dumps(jsonable(content), allow_nan=False, indent=1) + "\n"

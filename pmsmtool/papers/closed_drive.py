@@ -247,7 +247,7 @@ def closed_drive(seed: int) -> Reproduction:
     worst = shown["unreachable references", "closed, as delivered"]
     checks.append(at_least("as delivered, unreachable references: saturated periods", worst.saturated, 1, "1"))
     return Reproduction(
-        "closed-drive", "drive with fixed firmware, level standard: guarantee and cost", OURS,
+        OURS,
         (Table(f"{PROFILE}, up to {promised.n_rpm:.5g} rpm", HEADS, tuple(rows)), _cost(promised)),
         _panels(promised, shown), tuple(checks), made.notes,
     )  # fmt: skip

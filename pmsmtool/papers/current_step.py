@@ -117,8 +117,6 @@ def q_steps(seed: int) -> Reproduction:
         "the paper prints no numbers for this figure: checked against an independent computation of the same case",
     )
     return Reproduction(
-        "jercic-fig10",
-        "Reference governor: step of i_q under the voltage limit",
         f"{JERCIC}, figure 10",
         (table,),
         tuple(panels),

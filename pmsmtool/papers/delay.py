@@ -60,9 +60,7 @@ def delay_and_predictor(seed: int) -> Reproduction:
         "error against the reference of the period before: neither delay nor model error charges them",
     )
     panel = Panel(f"{SPEEDS_RPM[-1]:g} rpm", "time / ms", "i_q / A", tuple(shown))
-    return Reproduction(
-        "governor-delay", "One period of computation delay", OURS, (table,), (panel,), tuple(checks), notes
-    )
+    return Reproduction(OURS, (table,), (panel,), tuple(checks), notes)
 
 
 def _line(seen: Response) -> tuple[np.ndarray, np.ndarray]:

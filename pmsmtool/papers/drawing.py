@@ -21,7 +21,7 @@ GREY = "#9ca3af"
 _WIDTH, _HEIGHT = 7.5, 2.6
 
 
-def figure_of(found: Reproduction) -> Figure:
+def figure_of(found: Reproduction, title: str) -> Figure:
     """Return the panels of a reproduction as one figure.
 
     Raises
@@ -30,9 +30,7 @@ def figure_of(found: Reproduction) -> Figure:
         It is a table without a plot.
     """
     if not found.panels:
-        raise ConfigError(
-            f"{found.name} is a table, there is nothing to plot", where="reproduce", hint="leave --plot out"
-        )
+        raise ConfigError(f"a table, there is nothing to plot: {title}", where="reproduce", hint="leave --plot out")
     from matplotlib.figure import Figure
 
     columns = min(found.columns, len(found.panels))
@@ -45,7 +43,7 @@ def figure_of(found: Reproduction) -> Figure:
         _draw(cell, panel)
     for cell in axes.ravel()[len(found.panels) :]:
         cell.set_axis_off()
-    figure.suptitle(found.title, fontsize=10)
+    figure.suptitle(title, fontsize=10)
     return figure
 
 

@@ -216,14 +216,10 @@ class Panel:
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """A figure or table of a paper, recomputed.
+    """A figure or table of a paper, recomputed; its name and title are in the registry.
 
     Attributes
     ----------
-    name : str
-        As in the registry.
-    title : str
-        What it shows.
     source : str
         Paper and figure, DOI.
     tables : tuple of Table
@@ -238,8 +234,6 @@ class Reproduction:
         Panels side by side.
     """
 
-    name: str
-    title: str
     source: str
     tables: tuple[Table, ...] = ()
     panels: tuple[Panel, ...] = ()

@@ -66,7 +66,7 @@ def horizons(seed: int) -> Reproduction:
         f'"not finitely determined": beyond {CAP} rows',
     )
     return Reproduction(
-        "jercic-horizon", "Horizon and matrices of the reference governor", f"{JERCIC}, (15)-(30)",
+        f"{JERCIC}, (15)-(30)",
         (Table("k_max", heads, tuple(rows)), matrices), (), (*matrix_checks, *checks), notes,
     )  # fmt: skip
 

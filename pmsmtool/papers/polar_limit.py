@@ -284,8 +284,6 @@ def modulation_limit(seed: int) -> Reproduction:
         "linear-range laws (modes 3 to 5) lose torque at the voltage limit, down to the wrong sign above base speed",
     )
     return Reproduction(
-        "polar-limit",
-        "at and beyond the linear modulation limit",
         SOURCE,
         (modulator, beyond, reach),
         plots,

@@ -110,10 +110,10 @@ def _stairs(
     return Table(f"0 -> 1 -> 0 -> -1 -> 0 N m, worst step; {bench.name}", _COLUMNS, rows), found
 
 
-def _figure(name: str, title: str, rpm: float, bench: Bench, seed: int, checks: Sequence[Check]) -> Reproduction:
+def _figure(rpm: float, bench: Bench, seed: int, checks: Sequence[Check]) -> Reproduction:
     table, _ = _stairs((LINEAR, *BASELINES), bench, seed)
     plots = panels(response(LINEAR, rpm, bench, seed=seed), LEAD_S - 0.005)
-    return Reproduction(name, title, SOURCE, (table,), plots, tuple(checks), ASSUMED, columns=2)
+    return Reproduction(SOURCE, (table,), plots, tuple(checks), ASSUMED, columns=2)
 
 
 def figure_7(seed: int) -> Reproduction:
@@ -124,7 +124,7 @@ def figure_7(seed: int) -> Reproduction:
         near("settling at 0 rpm", 2.6, m.settle_ms, "ms", absolute=0.3, where=EXPECTED),
         at_most("peak i_d at 0 rpm", m.i_d_a, 0.01, "A", expected=0.0, where=EXPECTED),
     )
-    return _figure("miyajima-fig7", "linear range at 0 rpm", LOW_RPM, SIMULATION, seed, checks)
+    return _figure(LOW_RPM, SIMULATION, seed, checks)
 
 
 def figure_8(seed: int) -> Reproduction:
@@ -147,7 +147,7 @@ def figure_8(seed: int) -> Reproduction:
         at_least("(15) as printed: peak i_d at 400 rpm", printed.i_d_a, 3.0, "A", expected=8.2, where=EXPECTED),
         near("(15) as printed: overshoot at 0 rpm", 18.5, blind.over, "%", absolute=1.5, where=EXPECTED),
     )
-    return _figure("miyajima-fig8", "linear range at 400 rpm", HIGH_RPM, SIMULATION, seed, checks)
+    return _figure(HIGH_RPM, SIMULATION, seed, checks)
 
 
 def figure_9(seed: int) -> Reproduction:
@@ -157,7 +157,7 @@ def figure_9(seed: int) -> Reproduction:
     checks = (
         at_least("rms phase step at 0 N m, 0 rpm", rest, 0.2, "rad", expected=0.5, where="Fig. 9 (d); " + EXPECTED),
     )
-    return _figure("miyajima-fig9", "linear range at 0 rpm with noise and dead time", LOW_RPM, EXPERIMENT, seed, checks)
+    return _figure(LOW_RPM, EXPERIMENT, seed, checks)
 
 
 def figure_10(seed: int) -> Reproduction:
@@ -169,9 +169,7 @@ def figure_10(seed: int) -> Reproduction:
             "rms phase step at 0 N m, 400 rpm", rest, 0.05, "rad", expected=0.0143, where="Fig. 10 (d); " + EXPECTED
         ),
     )
-    return _figure(
-        "miyajima-fig10", "linear range at 400 rpm with noise and dead time", HIGH_RPM, EXPERIMENT, seed, checks
-    )
+    return _figure(HIGH_RPM, EXPERIMENT, seed, checks)
 
 
 def compared(seed: int) -> Reproduction:
@@ -209,9 +207,7 @@ def compared(seed: int) -> Reproduction:
         Panel("400 rpm, q-axis current", "time / ms", "i_q / A", tuple(Series(name, t, r.i_q) for name, r in runs)),
         Panel("400 rpm, d-axis current", "time / ms", "i_d / A", tuple(Series(name, t, r.i_d) for name, r in runs)),
     )
-    return Reproduction(
-        "polar-linear", "linear range, every law", SOURCE, (table, with_delay, reversals), plots, tuple(checks), ASSUMED
-    )
+    return Reproduction(SOURCE, (table, with_delay, reversals), plots, tuple(checks), ASSUMED)
 
 
 # ---- noise at zero voltage -------------------------------------------------------------------------------------
@@ -291,8 +287,6 @@ def at_zero_voltage(seed: int, realisations: int = 16, spikes: int = 30) -> Repr
         "means over noise realisations; V_a = 0 at standstill without torque is the uncontrollable point of (13)",
     )
     return Reproduction(
-        "polar-noise",
-        "phase oscillation around zero voltage",
         SOURCE,
         (Table("0.05 A of noise per axis, no delay", columns, tuple(rows)),),
         plots,

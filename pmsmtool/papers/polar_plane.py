@@ -96,9 +96,7 @@ def equilibria(seed: int) -> Reproduction:
         *_identities(),
     )
     table = Table("least-loss steady state; out of reach: the largest torque at full voltage", columns, rows)
-    return Reproduction(
-        "polar-equilibria", "equilibrium search and linear model", SOURCE, (table,), _loci(), checks, ASSUMED, columns=2
-    )
+    return Reproduction(SOURCE, (table,), _loci(), checks, ASSUMED, columns=2)
 
 
 def _loci() -> tuple[Panel, ...]:
@@ -238,8 +236,6 @@ def controllability(seed: int) -> Reproduction:
         "true two-input loop: both PIDs on the coupled machine; in field weakening the amplitude rests at its limit",
     )
     return Reproduction(
-        "polar-map",
-        "controllability over speed and torque",
         SOURCE,
         (Table("conditioning", columns, tuple(rows)), stability),
         _panels(),
@@ -374,8 +370,6 @@ def gain_schedules(seed: int) -> Reproduction:
         Panel(title, "speed / rpm", unit, _lines(curves, pick), x_log=False, y_log=True) for title, unit, pick in drawn
     )
     return Reproduction(
-        "polar-gains",
-        "gain schedules",
         SOURCE,
         (Table("gains over speed and torque", columns, tuple(rows)),),
         plots,

@@ -138,6 +138,4 @@ def transitions(seed: int) -> Reproduction:
         t = 1e3 * runs[0][1].t[kept]
         lines = tuple(Series(name, t, 1e3 * (r.torque - r.torque_asked)[kept]) for name, r in runs)
         plots.append(Panel(ramp.name, "time / ms", "torque error / mN m", lines))
-    return Reproduction(
-        "polar-ramps", "transitions on ramps", SOURCE, tuple(tables), tuple(plots), tuple(checks), ASSUMED
-    )
+    return Reproduction(SOURCE, tuple(tables), tuple(plots), tuple(checks), ASSUMED)

@@ -224,8 +224,6 @@ def salient(seed: int) -> Reproduction:
         " limit leaves less, it gives what they leave",
     )
     return Reproduction(
-        "polar-salient",
-        "machines with L_d != L_q",
         "ours",
         (laws, Table("steady state", columns, tuple(rows)), reached),
         plots,

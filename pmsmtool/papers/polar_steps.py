@@ -131,11 +131,9 @@ def panels(r: Response, lead_s: float = LEAD_S, *, phase_limit: bool = True) -> 
     )
 
 
-def _figure(name: str, title: str, law: Controller, bench: Bench, seed: int, checks: Sequence[Check]) -> Reproduction:
+def _figure(law: Controller, bench: Bench, seed: int, checks: Sequence[Check]) -> Reproduction:
     table, _ = _table((law, *BASELINES), bench, seed)
     return Reproduction(
-        name,
-        title,
         SOURCE,
         (table,),
         panels(response(law, bench, seed), phase_limit=False),
@@ -154,9 +152,7 @@ def figure_2(seed: int) -> Reproduction:
         Check("conventional: settling up", 11.0, m.up_ms, "ms", 8.0, 13.0, EXPECTED),
         Check("conventional: settling down", 10.7, m.down_ms, "ms", 8.0, 13.0, EXPECTED),
     )
-    return _figure(
-        "miyajima-fig2", "conventional voltage-phase control at 800 rpm", CONVENTIONAL, SIMULATION, seed, checks
-    )
+    return _figure(CONVENTIONAL, SIMULATION, seed, checks)
 
 
 def figure_3(seed: int) -> Reproduction:
@@ -183,9 +179,7 @@ def figure_3(seed: int) -> Reproduction:
             where=EXPECTED,
         ),
     )
-    return _figure(
-        "miyajima-fig3", "proposed phase and amplitude control at 800 rpm", PROPOSED, SIMULATION, seed, checks
-    )
+    return _figure(PROPOSED, SIMULATION, seed, checks)
 
 
 def figure_4(seed: int) -> Reproduction:
@@ -196,9 +190,7 @@ def figure_4(seed: int) -> Reproduction:
         Check("conventional: settling up", 11.0, m.up_ms, "ms", 8.0, 13.0, EXPECTED),
         Check("conventional: settling down", 10.7, m.down_ms, "ms", 8.0, 13.0, EXPECTED),
     )
-    return _figure(
-        "miyajima-fig4", "conventional control with noise, delay and dead time", CONVENTIONAL, EXPERIMENT, seed, checks
-    )
+    return _figure(CONVENTIONAL, EXPERIMENT, seed, checks)
 
 
 def figure_5(seed: int) -> Reproduction:
@@ -212,9 +204,7 @@ def figure_5(seed: int) -> Reproduction:
         Check("settling up / conventional", 0.83, new.up_ms / old.up_ms, "1", 0.65, 1.15, EXPECTED),
         Check("settling down / conventional", 0.83, new.down_ms / old.down_ms, "1", 0.65, 1.15, EXPECTED),
     )
-    return _figure(
-        "miyajima-fig5", "proposed control with noise, delay and dead time", PROPOSED, EXPERIMENT, seed, checks
-    )
+    return _figure(PROPOSED, EXPERIMENT, seed, checks)
 
 
 def compared(seed: int) -> Reproduction:
@@ -261,8 +251,6 @@ def compared(seed: int) -> Reproduction:
         "field weakening by optimisation brings i_d back more slowly after the step down than the table",
     )
     return Reproduction(
-        "polar-steps",
-        "torque steps at 800 rpm, every law",
         SOURCE,
         (table, noisy_table, whole_table),
         plots,

@@ -203,8 +203,6 @@ def sweep(seed: int, machines: int = 100) -> Reproduction:
         f"amperes are power-invariant, {PEAK:.4f} A peak each, the last column is peak",
     )
     return Reproduction(
-        "polar-sweep",
-        "no failure over speeds, loads and parameters",
         SOURCE,
         tuple(tables),
         plots,

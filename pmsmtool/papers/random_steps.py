@@ -108,7 +108,7 @@ def random_steps(seed: int, cases: int = 300) -> Reproduction:
     differences = difference_table("settling over T_min, T_min > 1 ms", pairs, np.random.default_rng(seed))
     panel = _distribution(outcomes, least, slow)
     return Reproduction(
-        "governor-random-steps", "Random reachable current steps against minimum time", OURS, (table, differences),
+        OURS, (table, differences),
         (panel,), tuple(checks), _notes(),
     )  # fmt: skip
 
@@ -269,7 +269,7 @@ def unreachable_references(seed: int, cases: int = 300) -> Reproduction:
         "with noise the observer moves the steady-state row by some tenths of a volt, and what stands on it wanders",
     )
     return Reproduction(
-        "governor-unreachable", "References that need more voltage than there is", OURS, (table, differences),
+        OURS, (table, differences),
         tuple(panels), tuple(checks), notes,
     )  # fmt: skip
 
@@ -346,8 +346,6 @@ def plant_mismatch(seed: int, cases: int = 300) -> Reproduction:
         "the offset-free rows of the best mode take what the integrators or the observer hold for constant",
     )
     return Reproduction(
-        "plant-mismatch",
-        "Governor on a plant that is not its model",
         OURS,
         (table, differences),
         (),
@@ -382,9 +380,7 @@ def voltage_limit(seed: int, cases: int = 1000) -> Reproduction:
     )  # fmt: skip
     table = Table(f"{cases} random steps, half of them to unreachable currents, 10 ms each", heads, tuple(rows))
     notes = ("a check only: row 0 can always be met, and the applied voltage is limited whatever is demanded",)
-    return Reproduction(
-        "governor-voltage-limit", "Voltage demand under the governor", OURS, (table,), (), tuple(checks), notes
-    )
+    return Reproduction(OURS, (table,), (), tuple(checks), notes)
 
 
 APPLIED_LIMIT = 1e-6

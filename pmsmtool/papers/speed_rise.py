@@ -100,7 +100,7 @@ def speed_ramp(seed: int) -> Reproduction:
                 ]
     table = Table("620 to 900 rpm in 20 ms, reference (0, 28) A held for 100 ms", HEADS, tuple(rows))
     return Reproduction(
-        "speed-ramp", "Speed ramp 620 to 900 rpm without field weakening", OURS, (table,), _panels(shown),
+        OURS, (table,), _panels(shown),
         tuple(checks), _notes(),
     )  # fmt: skip
 
@@ -129,7 +129,7 @@ def speed_steps(seed: int) -> Reproduction:
     checks.append(at_least(f"{what}: beyond the recovery asked for", least_ms, RECOVERY_MS[-1], "ms", where="physics"))
     table = Table("speed step from 620 rpm, reference (0, 28) A held for 100 ms", HEADS, tuple(rows))
     return Reproduction(
-        "speed-steps", "Speed steps without field weakening (shown: to 1200 rpm)", OURS,
+        OURS,
         (table, _recovery(rows, least_ms)), _panels(shown), tuple(checks), (*_notes(), _least_note(least_ms)),
     )  # fmt: skip
 

@@ -132,7 +132,7 @@ def table_2(seed: int) -> Reproduction:
     found = _table_2()
     table = Table(_title(), HEADS, tuple(run.row for runs in found.values() for run in runs.values()))
     return Reproduction(
-        "jercic-table2", "Robustness of field weakening", f"{JERCIC}, table 2", (table,), (),
+        f"{JERCIC}, table 2", (table,), (),
         (*_printed(), *_checks(found)), _notes(),
     )  # fmt: skip
 
@@ -174,7 +174,7 @@ def figure_11(seed: int) -> Reproduction:
     names = (COMPENSATED.name, ACCELERATED.name, UNCOMPENSATED.name)
     rows = tuple(runs[name].row for runs in found.values() for name in names)
     return Reproduction(
-        "jercic-fig11", "Field weakening with and without compensation", f"{JERCIC}, figure 11",
+        f"{JERCIC}, figure 11",
         (Table(_title(), HEADS, rows),), tuple(ordered), _checks(found), _notes(), columns=2,
     )  # fmt: skip
 
@@ -267,7 +267,7 @@ def figure_12(seed: int) -> Reproduction:
     sweep_table = Table(f"{TORQUE_NM:g} N m held, 400 to 800 rpm in 0.6 s and back", heads, tuple(rows))
     slopes, slope_checks = _slopes()
     return Reproduction(
-        "jercic-fig12", "Field-weakening sweep", f"{JERCIC}, figure 12", (sweep_table, slopes), _sweep_panels(runs),
+        f"{JERCIC}, figure 12", (sweep_table, slopes), _sweep_panels(runs),
         (*checks, *slope_checks), (*_notes()[:1], "the paper forces the speed by a load machine at unknown slopes"),
     )  # fmt: skip
 

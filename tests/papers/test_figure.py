@@ -80,13 +80,13 @@ def test_cells_have_the_digits_of_their_column() -> None:
 def example(panels: int = 1) -> Reproduction:
     x = np.array([0.0, 1.0, 2.0])
     panel = Panel("p", "time / s", "i / A", (Series("one", x, x**2), Series("two", x, np.array([1.0, math.nan, 2.0]))))
-    return Reproduction("n", "t", "s", (), (panel,) * panels, (Check("w", 1.0, 5.0, "A", 0.0, 2.0, "read off fig. 1"),))
+    return Reproduction("s", (), (panel,) * panels, (Check("w", 1.0, 5.0, "A", 0.0, 2.0, "read off fig. 1"),))
 
 
 def test_the_checked_numbers_are_the_last_table() -> None:
     assert not example().good
     assert tables_of(example())[-1].title.startswith("checked numbers")
-    assert tables_of(Reproduction("n", "t", "s")) == ()
+    assert tables_of(Reproduction("s")) == ()
 
 
 def test_csv_has_a_line_per_point_and_nothing_for_a_missing_one() -> None:
@@ -99,12 +99,12 @@ def test_csv_has_a_line_per_point_and_nothing_for_a_missing_one() -> None:
 
 @pytest.mark.chain
 def test_every_panel_is_drawn() -> None:
-    figure = figure_of(example(3))
+    figure = figure_of(example(3), "t")
     assert len(figure.axes) == 3
     assert [line.get_label() for line in figure.axes[0].get_lines()] == ["one", "two"]
     assert figure.axes[0].get_xlabel() == "time / s"
     with pytest.raises(ConfigError, match="nothing to plot"):
-        figure_of(Reproduction("n", "t", "s"))
+        figure_of(Reproduction("s"), "t")
 
 
 @pytest.mark.parametrize("row", FIGURES, ids=lambda row: row.name)

@@ -63,7 +63,6 @@ def cells(found: Reproduction, column: str, table: int = 0, **where: Any) -> lis
 @pytest.mark.parametrize("name", MADE)
 def test_every_checked_number_is_within(name: str) -> None:
     found = made(name)
-    assert found.name == name
     assert found.checks
     assert [(check.what, check.ours, check.allowed) for check in found.checks if not check.within] == []
     assert all(found.notes)

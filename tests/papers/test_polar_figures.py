@@ -46,7 +46,6 @@ def test_every_plotted_figure_of_the_paper_is_there() -> None:
 @pytest.mark.parametrize("name", sorted(ROWS))
 def test_figure_is_within_its_ranges_and_prints_the_baselines(name: str) -> None:
     figure = compute(name)
-    assert figure.name == name
     assert figure.checks
     missed = [(check.what, check.ours, check.allowed) for check in figure.checks if not check.within]
     assert missed == []

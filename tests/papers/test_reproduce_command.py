@@ -77,7 +77,7 @@ def test_json_has_the_checks_and_one_file_can_be_asked_for(pmsmtool: Command, tm
 
 
 def outside(seed: int) -> Reproduction:
-    return Reproduction("bad", "t", "s", checks=(at_most("the number", 2.0 + seed, 1.0, "A"),))
+    return Reproduction("s", checks=(at_most("the number", 2.0 + seed, 1.0, "A"),))
 
 
 def test_a_number_out_of_range_is_exit_code_1_after_the_table(
