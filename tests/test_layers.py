@@ -23,6 +23,7 @@ PACKAGE = ROOT / "pmsmtool"
 
 FLOORS: dict[str, int] = {
     "errors": 0,
+    "arrays": 1,
     "plain_text": 1,
     "cia402": 1,
     "data_types": 1,

@@ -17,11 +17,13 @@ from pmsmtool.data_types import BY_SHORT, DATA_TYPES
 
 PACKAGE = Path(__file__).resolve().parent.parent / "pmsmtool"
 PATTERNS = {
+    "arrays.py": re.compile(r"^\w+ = NDArray\[np\.(?:float64|complex128)\]$", re.MULTILINE),
+    "native.py": re.compile(r"_fields_ = \("),
     "machine/temperature.py": re.compile(r"\b0?\.00393\d*\b|\b3\.93e-0?3\b"),
     "units.py": re.compile(r"\bpi / (?:30|60)(?:_?000)?\b|\b(?:30|60)(?:\.0)? / \(?(?:2(?:\.0)? \* )?(?:math|np)\.pi"),
     "machine/torque.py": re.compile(r"\b(?:1\.5|3\.0 / 2\.0|\w*FACTOR) \* (?:\w+\.)*(?:pole_pairs|p)\b"),
 }
-"""Home of each formula, and what a copy of it looks like."""
+"""Home of each formula, type and struct of the kernels, and what a copy of it looks like."""
 TYPE_NAMES = frozenset(DATA_TYPES) | frozenset(BY_SHORT)
 OTHER_NUMBERS = frozenset({"ingenia_objects.py"})
 """A maker's own numbers of the types, which are not those of CiA 301."""
@@ -58,6 +60,8 @@ def test_nothing_in_the_package_is_a_copy() -> None:
 @pytest.mark.parametrize(
     "line",
     [
+        "Array = NDArray[np.float64]",
+        "_fields_ = (('pole_pairs', ctypes.c_double),)",
         "ALPHA = 0.00393",
         "rpm = omega * 30.0 / math.pi",
         "omega = rpm * math.pi / 30.0",

@@ -23,6 +23,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array, Complex
 from pmsmtool.axis.reference import Move
 from pmsmtool.design.loops.sampled_loop import SampledLoop
 from pmsmtool.design.loops.speed_loop import (
@@ -36,8 +37,6 @@ from pmsmtool.design.loops.speed_loop import (
 )
 from pmsmtool.machine.two_masses import Mechanics, sampled
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 Structure = Literal["cascade", "pid"]
 Loop = Literal["speed", "position"]
 

@@ -6,12 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
 
 WINDOW = 0.01
 """Window in which the error of a move has settled, of its way."""

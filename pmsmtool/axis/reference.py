@@ -12,11 +12,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,11 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array, Complex
 from pmsmtool.axis.loops import AxisGains, AxisPath, Lifted, Loop, closed_loop_poles, open_loop
 from pmsmtool.design.loops.sampled_loop import LoopMargins
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 GRID_POINTS = 240
 GRID_START = 1e-4

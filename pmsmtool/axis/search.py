@@ -14,15 +14,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array, Complex
 from pmsmtool.axis.loops import AxisGains, AxisPath, Lifted, Loop, closed_loop_poles, lifted, open_loop
 from pmsmtool.axis.robustness import AxisMargins, axis_margins, gain_crossings, grid
 from pmsmtool.design.loops.speed_loop import Notch
 from pmsmtool.errors import DesignInfeasible
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 LOOPS: tuple[Loop, ...] = ("speed", "position")
 
 INTEGRAL_RATIOS = (3.0, 4.0, 6.0, 9.0, 14.0)

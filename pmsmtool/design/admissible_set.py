@@ -19,10 +19,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.loops.current_loop import CurrentGains
 from pmsmtool.errors import DesignInfeasible
-
-Array = NDArray[np.float64]
 
 REDUNDANT = 1e-6
 """A row is redundant when no admissible state exceeds it by more than this share of V_max."""

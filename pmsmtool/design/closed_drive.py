@@ -20,8 +20,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.lookup.table import RPM, torque_limits
 from pmsmtool.design.loops.open_loops import (
@@ -43,8 +43,6 @@ from pmsmtool.errors import ConfigError, DesignInfeasible, NotAvailable
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 from pmsmtool.machine.torque import torque_per_ampere
-
-Array = NDArray[np.float64]
 
 RATED, SLOPE, TORQUE, CURRENT, SPEED = (
     "reference.tau_rated_nm", "reference.torque_slope_nm_per_s", "speed.tau_max_nm", "motor.I_max_apk",

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pmsmtool.design.admissible_set import Horizon, PredictionModel, StateBounds, horizon
 from pmsmtool.design.design_file import DesignValue, Scalar
@@ -23,8 +22,6 @@ from pmsmtool.design.slope_response import matrix_exponential
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import K_MAX_NOT_DETERMINED
-
-Array = NDArray[np.float64]
 
 MODES: Mapping[str, int] = {"off": 0, "paper": 1, "line": 2, "best": 3, "linearised": 4, "observe": 5}
 """``governor.mode`` of the catalogue."""

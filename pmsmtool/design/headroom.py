@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.lookup.table import CUT, NONE, electrical_speed, speed_table
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import Ratings
@@ -21,8 +21,6 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 from pmsmtool.machine.torque import air_gap_torque
-
-Array = NDArray[np.float64]
 
 TORQUE_SHARES = (-1.0, -0.5, 0.0, 0.5, 1.0)
 """Torques of the cells, over rated torque."""

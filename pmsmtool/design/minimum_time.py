@@ -15,11 +15,10 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import DesignInfeasible
 
-Array = NDArray[np.float64]
 VoltageSet = Literal["circle", "hexagon"]
 
 DIRECTIONS = 72

@@ -15,16 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pmsmtool.arrays import Array
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_cells import FluxMapStruct, library
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 from pmsmtool.machine.torque import air_gap_torque
 from pmsmtool.native import parse_structs
-
-Array = NDArray[np.float64]
 
 _STRUCTS = parse_structs(
     Path(__file__).with_name("lookup").joinpath("current_plane.h").read_text(encoding="ascii"),

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.polar import (
     AMPLITUDE_SIGMA_RAD_S,
     PHASE_SIGMA_RAD_S,
@@ -27,8 +27,6 @@ from pmsmtool.design.polar import (
 )
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.units import RAD_S_PER_RPM
-
-Array = NDArray[np.float64]
 
 RPM = RAD_S_PER_RPM
 RANK_TOLERANCE = 1e-9

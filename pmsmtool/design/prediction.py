@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pmsmtool.arrays import Array
+
 Key = TypeVar("Key")
 
 MODEL_ALLOWANCE = 1.3

@@ -20,11 +20,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import DesignInfeasible
 
-Array = NDArray[np.float64]
 Interval = tuple[float, float]
 
 SETTLED, TAIL = 1e-4, 1e-3

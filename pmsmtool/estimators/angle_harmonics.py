@@ -16,9 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import Legendre, legvander
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pmsmtool.arrays import Array
 
 ENCODER_ORDERS = (1, 2)
 """Orders that are the encoder's: mounted off centre, and oval."""

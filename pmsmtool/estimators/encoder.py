@@ -12,14 +12,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
 STAGE = "encoder"
-Vector = NDArray[np.float64]
 
 INTEGER_LIMIT = 0.1
 """Largest distance of the count from an integer (docs/identification.md, 3.6)."""
@@ -192,9 +191,9 @@ def _slope(trace: Trace) -> float:
     return float(centred @ (imposed - np.mean(imposed))) / power
 
 
-def _wrap(angle: Vector) -> Vector:
+def _wrap(angle: Array) -> Array:
     return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
 
 
-def _circular_mean(angle: Vector) -> float:
+def _circular_mean(angle: Array) -> float:
     return math.atan2(float(np.mean(np.sin(angle))), float(np.mean(np.cos(angle))))

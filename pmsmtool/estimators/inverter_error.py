@@ -7,11 +7,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.least_squares import levenberg_marquardt
-
-Vector = NDArray[np.float64]
 
 KNEE_RANGE = 10.0
 """Ratio by which a knee may lie below the smallest level, or above the largest."""
@@ -33,18 +31,18 @@ class InverterCurve:
         Largest difference between the signs (V).
     """
 
-    i_phase_a: Vector
-    u_error_v: Vector
+    i_phase_a: Array
+    u_error_v: Array
     asymmetry_v: float
 
-    def error_v(self, i_phase_a: Vector) -> Vector:
+    def error_v(self, i_phase_a: Array) -> Array:
         """Error at any phase current: linear between the points and through zero, constant beyond the last (V)."""
         magnitude = np.abs(i_phase_a)
         x = np.concatenate([[0.0], self.i_phase_a])
         y = np.concatenate([[0.0], self.u_error_v])
         return np.asarray(np.sign(i_phase_a) * np.interp(magnitude, x, y), dtype=np.float64)
 
-    def error_dq_v(self, i_d_a: Vector, i_q_a: Vector, theta_e_rad: Vector) -> tuple[Vector, Vector]:
+    def error_dq_v(self, i_d_a: Array, i_q_a: Array, theta_e_rad: Array) -> tuple[Array, Array]:
         """Error of the three phases in a frame at ``theta_e_rad`` (V, amplitude-invariant)."""
         c, s = np.cos(theta_e_rad), np.sin(theta_e_rad)
         i_alpha, i_beta = c * i_d_a - s * i_q_a, s * i_d_a + c * i_q_a
@@ -55,9 +53,7 @@ class InverterCurve:
         e_alpha, e_beta = (2.0 * e_a - e_b - e_c) / 3.0, (e_b - e_c) / root
         return c * e_alpha + s * e_beta, c * e_beta - s * e_alpha
 
-    def along_axis(
-        self, frame_rad: float, axis: str, i_a: Vector, other_a: float, bias_a: float
-    ) -> tuple[Vector, Vector]:
+    def along_axis(self, frame_rad: float, axis: str, i_a: Array, other_a: float, bias_a: float) -> tuple[Array, Array]:
         """Error along one axis of a frozen frame (V), of the legs that take current in and of those that feed it out.
 
         Parameters
@@ -92,7 +88,7 @@ class InverterCurve:
         # an inverter without an error has a plateau and a curve of noise, which fit with no knee at all
         low, high = math.log(x[0] / KNEE_RANGE), math.log(x[-1] * KNEE_RANGE)
 
-        def residual(log_knee: Vector) -> Vector:
+        def residual(log_knee: Array) -> Array:
             knee = math.exp(min(max(float(log_knee[0]), low), high))
             return np.asarray(y / V_plateau_v - np.minimum(1.0, x / knee), dtype=np.float64)
 
@@ -103,7 +99,7 @@ class InverterCurve:
         return math.exp(min(max(float(fit.x[0]), low), high))
 
 
-def curve_from_levels(i_vector_a: Vector, u_vector_v: Vector, phase_factor: float) -> InverterCurve:
+def curve_from_levels(i_vector_a: Array, u_vector_v: Array, phase_factor: float) -> InverterCurve:
     """Curve of one phase from the remainder of DC levels along a vector with one phase idle.
 
     Parameters

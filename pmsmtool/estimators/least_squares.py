@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
-Residual = Callable[[Vector], Vector]
+from pmsmtool.arrays import Array
+
+Residual = Callable[[Array], Array]
 
 RELATIVE_STEP = 1e-5
 """Relative step of the central differences (docs/identification.md, 4)."""
@@ -41,8 +42,8 @@ class Fit:
         Accepted and rejected steps.
     """
 
-    x: Vector
-    residual: Vector
+    x: Array
+    residual: Array
     jacobian: NDArray[np.float64]
     converged: bool
     iterations: int
@@ -58,7 +59,7 @@ class Fit:
         return len(self.residual) - len(self.x)
 
 
-def central_jacobian(residual: Residual, x: Vector, step: Vector) -> NDArray[np.float64]:
+def central_jacobian(residual: Residual, x: Array, step: Array) -> NDArray[np.float64]:
     """Derivative of a residual by central differences.
 
     Parameters
@@ -80,13 +81,13 @@ def central_jacobian(residual: Residual, x: Vector, step: Vector) -> NDArray[np.
 
 def levenberg_marquardt(
     residual: Residual,
-    x0: Vector,
-    scale: Vector,
+    x0: Array,
+    scale: Array,
     *,
     iterations: int = 60,
     tolerance: float = 1e-9,
     cost_tolerance: float = 0.0,
-    derivative: Callable[[Vector], NDArray[np.float64]] | None = None,
+    derivative: Callable[[Array], NDArray[np.float64]] | None = None,
 ) -> Fit:
     """Minimise the sum of squares of ``residual(x)``.
 
@@ -147,8 +148,8 @@ def levenberg_marquardt(
 
 
 def linear_solve(
-    columns: NDArray[np.float64], target: Vector, weight: Vector
-) -> tuple[Vector, NDArray[np.float64], Vector, float]:
+    columns: NDArray[np.float64], target: Array, weight: Array
+) -> tuple[Array, NDArray[np.float64], Array, float]:
     """Weighted linear least squares with columns scaled to unit norm.
 
     Parameters

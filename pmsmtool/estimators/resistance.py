@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.estimate import (
     CHI2_REFUSE,
     COVERAGE_FACTOR,
@@ -42,7 +43,6 @@ from pmsmtool.trace import Trace
 STAGE = "resistance"
 R_MEASURED = "R_s_ohm_measured"
 """Name of the resistance at the temperature of the test: what no normalisation widens."""
-Vector = NDArray[np.float64]
 
 TAIL_POWERS = (1, 2, 3, 4, 6)
 TAIL_TERMS = 2
@@ -166,7 +166,7 @@ class ResistanceResult:
 
 @dataclass(frozen=True, slots=True)
 class _TailFit:
-    x: Vector
+    x: Array
     covariance: NDArray[np.float64]
     chi2: float
     dof: int
@@ -280,7 +280,7 @@ def estimate_resistance(
     )
 
 
-def _link_fall(levels: Trace, i: Vector, error_v: Vector, noise_v: float) -> Vector:
+def _link_fall(levels: Trace, i: Array, error_v: Array, noise_v: float) -> Array:
     """Return by how much the DC link stands below its highest at each level (relative, negative).
 
     0 where it is not recorded, or moves the inverter's error by less than the noise of a level.
@@ -297,14 +297,14 @@ def _told_of_the_link(fall: float) -> str:
     return told if fall >= LINK_TOLD else ""
 
 
-def _warmth(t: Vector, T: Vector, fall: Vector, i: Vector, v: Vector, peak: float, sigma_v: float) -> Vector:
+def _warmth(t: Array, T: Array, fall: Array, i: Array, v: Array, peak: float, sigma_v: float) -> Array:
     """Return how the winding warms from level to level: with time, or where that does not fit, by its losses or sensor.
 
     What a sensor shows is a shape, too: of the loop only the copper warms, and how much of it that is, is not known.
     """
     from scipy.optimize import minimize_scalar
 
-    def misfit(warmth: Vector) -> float:
+    def misfit(warmth: Array) -> float:
         return min(_fit_tail(warmth, fall, i, v, peak, sigma_v, powers).chi2 for powers in tail_models())
 
     found = minimize_scalar(
@@ -318,7 +318,7 @@ def _warmth(t: Vector, T: Vector, fall: Vector, i: Vector, v: Vector, peak: floa
     return best if misfit(best) < misfit(t) - WARMING_GAIN else t
 
 
-def _heated(t: Vector, i: Vector, peak: float, tau_s: float) -> Vector:
+def _heated(t: Array, i: Array, peak: float, tau_s: float) -> Array:
     """Return the warmth of a winding of one time constant (1), cold before the first level: late in every level."""
     out, warm, before = np.empty_like(i), 0.0, float(t[0] - np.median(np.diff(t)))
     for k, (now, current) in enumerate(zip(t, i, strict=True)):
@@ -328,7 +328,7 @@ def _heated(t: Vector, i: Vector, peak: float, tau_s: float) -> Vector:
     return out
 
 
-def _level_sigma(t: Vector, fall: Vector, i: Vector, v: Vector, peak: float, R_0: float, noise_v: float) -> float:
+def _level_sigma(t: Array, fall: Array, i: Array, v: Array, peak: float, R_0: float, noise_v: float) -> float:
     """Standard deviation of one level (V): noise of the mean, and a model error as large as the levels scatter."""
     least = math.hypot(noise_v, MODEL_FLOOR_LEAST * R_0 * peak)
     fits = (_fit_tail(t, fall, i, v, peak, least, powers) for powers in tail_models())
@@ -336,7 +336,7 @@ def _level_sigma(t: Vector, fall: Vector, i: Vector, v: Vector, peak: float, R_0
     return min(max(1.0, math.sqrt(scatter)) * least, math.hypot(noise_v, MODEL_FLOOR * R_0 * peak))
 
 
-def two_point_slope(i: Vector, v: Vector) -> float:
+def two_point_slope(i: Array, v: Array) -> float:
     """Slope between the largest level and the one nearest to 60 % of it, mean of both signs (ohm)."""
     peak = float(np.max(np.abs(i)))
     high = np.abs(i) > 0.97 * peak
@@ -357,7 +357,7 @@ def two_point_slope(i: Vector, v: Vector) -> float:
     return R_0
 
 
-def _check_levels(levels: Trace, i: Vector, peak: float, R_0: float, noise: Noise) -> None:
+def _check_levels(levels: Trace, i: Array, peak: float, R_0: float, noise: Noise) -> None:
     used = np.abs(i) >= FIT_FROM * peak
     for sign in (1.0, -1.0):
         count = len(set(np.round(i[used & (np.sign(i) == sign)] / (0.02 * peak))))
@@ -378,7 +378,7 @@ def _check_levels(levels: Trace, i: Vector, peak: float, R_0: float, noise: Nois
         )
 
 
-def _settling(levels: Trace, peak: float, R_0: float, noise: Noise) -> tuple[Vector, Vector]:
+def _settling(levels: Trace, peak: float, R_0: float, noise: Noise) -> tuple[Array, Array]:
     """Change of v - R i between the halves of each window, and its limit (V)."""
     change = (levels["u_d_second_v"] - levels["u_d_first_v"]) - R_0 * (levels["i_d_second_a"] - levels["i_d_first_a"])
     sigma = 2.0 * R_0 * noise.sigma_a / math.sqrt(int(levels.meta["samples"]))  # difference of two halves
@@ -435,7 +435,7 @@ def _copper_share(copper: Copper, R_loop: float) -> float:
 
 
 def _fit_tail(
-    t: Vector, fall: Vector, i: Vector, v: Vector, peak: float, sigma_v: float, powers: tuple[int, ...]
+    t: Array, fall: Array, i: Array, v: Array, peak: float, sigma_v: float, powers: tuple[int, ...]
 ) -> _TailFit:
     """Fit the levels: R, V, v_0, drift, what of V falls with the link, and the tail."""
     used = np.abs(i) >= FIT_FROM * peak

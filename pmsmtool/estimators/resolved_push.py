@@ -38,6 +38,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.estimate import CONDITION_LIMIT, MEDIAN_TO_STD, scaled_covariance
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.trace import Trace
@@ -67,7 +68,6 @@ ITERATIONS = 5
 TOLD = 5
 """Coefficients that are told: R, psi_q, psi_d, L_q, V."""
 
-Vector = NDArray[np.float64]
 Rows = NDArray[np.complexfloating[Any, Any]]
 
 
@@ -127,11 +127,11 @@ class Blocks:
         Mean torque current (A).
     """
 
-    w: Vector
+    w: Array
     i: Rows
     slope: Rows
     u: Rows
-    weight: Vector
+    weight: Array
     rate: float
     lag: float
     i_q: float
@@ -141,8 +141,8 @@ class Blocks:
 class Resolved:
     """What the regression tells: values and standard deviations of R, psi_q, psi_d, L_q and V, shape (5,)."""
 
-    value: Vector
-    std: Vector
+    value: Array
+    std: Array
     reactance_v: float
     """Root mean square of w L_q i_q (V)."""
     rows: int
@@ -169,7 +169,7 @@ def push_blocks(push: Trace, period_s: float, pole_pairs: int) -> Blocks:
     if blocks < LEAST_BLOCKS:
         raise refuse("E_EXCITATION", f"a torque pulse of {len(push)} samples is too short", stage=STAGE)
 
-    def means(name: str) -> Vector:
+    def means(name: str) -> Array:
         signal = np.asarray(push[name], dtype=np.float64)[: blocks * BLOCK]
         return np.asarray(signal.reshape(blocks, BLOCK).mean(axis=1))
 
@@ -206,7 +206,7 @@ def push_blocks(push: Trace, period_s: float, pole_pairs: int) -> Blocks:
     )
 
 
-def _beats(w: Vector, spacing_s: float) -> Vector:
+def _beats(w: Array, spacing_s: float) -> Array:
     """Return the weights of blocks: beats of the inverter's harmonic with the samples in a block, at most 1."""
     cycles = HARMONIC * np.abs(w) * spacing_s / (2.0 * math.pi)
     return np.asarray(np.clip(np.abs(cycles - np.round(cycles)) * BLOCK, LEAST_WEIGHT, 1.0))
@@ -242,13 +242,13 @@ def resolve(pushes: Sequence[Blocks]) -> Resolved:
     return Resolved(value, np.sqrt(jackknife + values.var(axis=0, ddof=1)), reactance, len(w))
 
 
-def _above_noise(part: Vector) -> Vector:
+def _above_noise(part: Array) -> Array:
     """Return slopes with those that are only noise set to zero."""
     noise = MEDIAN_TO_STD * float(np.median(np.abs(part - np.median(part))))
     return np.asarray(np.where(np.abs(part) > SLOPE_NOISE * noise, part, 0.0))
 
 
-def _columns(shape: Shape, w: Vector, i: Rows, slope: Rows, u: Rows) -> list[Rows]:
+def _columns(shape: Shape, w: Array, i: Rows, slope: Rows, u: Rows) -> list[Rows]:
     """Return the regressors, shape (n,) each; the first :data:`TOLD` are those that are told."""
     size, speed = np.abs(i), np.abs(w)
     along, share = i / size, size / size.max()
@@ -270,7 +270,7 @@ def _columns(shape: Shape, w: Vector, i: Rows, slope: Rows, u: Rows) -> list[Row
     return columns
 
 
-def _fit(columns: Sequence[Rows], u: Rows, weight: Vector, owner: NDArray[np.int64], n: int) -> tuple[Vector, Vector]:
+def _fit(columns: Sequence[Rows], u: Rows, weight: Array, owner: NDArray[np.int64], n: int) -> tuple[Array, Array]:
     """Return the told coefficients, shape (5,), and those without each push, shape (n, 5)."""
     complex_matrix = np.column_stack(columns)
     matrix = np.vstack([complex_matrix.real, complex_matrix.imag])
@@ -300,6 +300,6 @@ def _fit(columns: Sequence[Rows], u: Rows, weight: Vector, owner: NDArray[np.int
     return (solution / scale)[:TOLD], without
 
 
-def _normal(matrix: Vector, measured: Vector, weights: Vector) -> tuple[Vector, Vector]:
+def _normal(matrix: Array, measured: Array, weights: Array) -> tuple[Array, Array]:
     weighted = matrix * weights[:, None]
     return matrix.T @ weighted, weighted.T @ measured

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.estimate import MEDIAN_TO_STD
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.tracking_model import (
@@ -34,8 +34,6 @@ from pmsmtool.estimators.tracking_model import (
     ripple_v,
 )
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
 
 STAGE = "tracking"
 WALK = {"R_s_ohm": 2e-3, "psi_f_wb": 3e-4}

@@ -20,11 +20,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.flux.linkage_rows import mean_inverter_error
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
 
 SIGNALS = ("u_d_v", "u_q_v", "i_d_a", "i_q_a", "omega_e_rad_s")
 """What an observation is made of; ``T_winding_c`` is kept beside it where it is recorded."""

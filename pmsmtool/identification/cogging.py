@@ -17,8 +17,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array, Complex
 from pmsmtool.estimators.angle_harmonics import (
     ENCODER_ORDERS,
     HIGHEST_ORDER,
@@ -38,8 +38,6 @@ from pmsmtool.trace import Trace
 if TYPE_CHECKING:
     from pmsmtool.identification.evaluate import Evaluation
 
-Array = NDArray[np.float64]
-Phasors = NDArray[np.complex128]
 
 COGGING_CSV = "cogging.csv"
 ROWS = 1024
@@ -157,7 +155,7 @@ def cogging_of(traces: Mapping[str, Trace], result: Evaluation) -> Cogging | Non
     return Cogging(harmonics, J, highest, math.inf, how)
 
 
-def torque_orders(t_s: Array, theta: Array, torque_nm: Array, J_kgm2: float, highest: int) -> Phasors:
+def torque_orders(t_s: Array, theta: Array, torque_nm: Array, J_kgm2: float, highest: int) -> Complex:
     """Return the torque over the angle by order, as phasors of exp(j order theta), shape (highest + 1,).
 
     Parameters
@@ -203,7 +201,7 @@ def torque_orders(t_s: Array, theta: Array, torque_nm: Array, J_kgm2: float, hig
 
 
 def _of_slow_turns(
-    both: Sequence[Phasors], J: Estimate, pole_pairs: int, steps_nm: Array, hidden_nm: Mapping[int, float]
+    both: Sequence[Complex], J: Estimate, pole_pairs: int, steps_nm: Array, hidden_nm: Mapping[int, float]
 ) -> Cogging:
     """Return the orders that stand out of what the directions differ by, and of what encoder and sensors hide.
 

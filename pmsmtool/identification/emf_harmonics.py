@@ -21,8 +21,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array, Complex
 from pmsmtool.estimators.estimate import SensorTolerance, coverage_factor
 from pmsmtool.estimators.injection.sampling_instant import Sampling
 from pmsmtool.estimators.injection.switching_ripple import Modulation, rippled_error_dq_v
@@ -35,8 +35,6 @@ from pmsmtool.trace import Trace
 if TYPE_CHECKING:
     from pmsmtool.identification.evaluate import Evaluation
 
-Array = NDArray[np.float64]
-Phasors = NDArray[np.complex128]
 
 TRACE = "turns_"
 """Followed by the number of a record."""
@@ -226,7 +224,7 @@ class _Row:
         error = bare if modulation is None else rippled_error_dq_v(curve, i, u, theta, modulation)
         signals = np.stack([*u, *i, *error, theta], axis=1)
         found = np.linalg.lstsq(np.concatenate(columns, axis=1), signals, rcond=None)[0][DEGREE + 1 :]
-        phasors: Phasors = found[: len(orders)] - 1j * found[len(orders) :]
+        phasors: Complex = found[: len(orders)] - 1j * found[len(orders) :]
         self.of = {order: phasors[order - 1] for order in ORDERS}
 
     def flux(self, n: int, circuit: Circuit) -> tuple[complex, complex]:

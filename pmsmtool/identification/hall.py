@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.hall import HALL_ORDERS, HALL_SECTOR_RAD, PHASES, hall_axis
 from pmsmtool.trace import Trace
 
-Array = NDArray[np.float64]
 STAGE = "Hall sensors"
 
 SPACED_60 = (0, 7)

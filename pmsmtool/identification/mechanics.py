@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.cross_check import cross_check
 from pmsmtool.estimators.estimate import SensorTolerance
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
     from pmsmtool.identification.evaluate import Evaluation
 
-Array = NDArray[np.float64]
 
 NOT_RIGID = ("E_MODEL_MISMATCH", "E_NOT_IDENTIFIABLE", "E_NOT_CONVERGED")
 """Reasons for which pushes are refused where a rigid shaft does not explain them."""

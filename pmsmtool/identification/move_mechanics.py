@@ -11,15 +11,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pmsmtool.axis.move import RESTING
 from pmsmtool.estimators.shaft.inertia_ratio import estimate_ratios
 from pmsmtool.identification.by_pulses import either_reading
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
 
 METHOD = "regression over position moves"
 GAP_S = 0.05

@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.estimate import CONDITION_LIMIT, information_bound
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, linear_solve
 from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR, Extent, disturbances
@@ -24,8 +24,6 @@ from pmsmtool.estimators.shaft.motion import positions
 from pmsmtool.estimators.shaft.position import position_std
 from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, HIGHEST_SHARE, LOWEST_HZ, ORDER
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
 
 RIPPLE = 2.2e-3
 """Deviation of a block's torque, of the push's, that the fits of random drives with a switched inverter took: median

@@ -19,9 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
-
-Array = NDArray[np.float64]
 
 GRID_S = 0.5e-3
 """Step of the model (s): half of the fastest sampling."""

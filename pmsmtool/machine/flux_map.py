@@ -32,8 +32,9 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.flux_map_cells import (
     KINDS,
@@ -46,8 +47,6 @@ from pmsmtool.machine.flux_map_cells import (
     pointer,
 )
 from pmsmtool.machine.torque import air_gap_torque
-
-Array = NDArray[np.float64]
 
 NODES_MAX = 1 << 19
 """Of each of the two tables: 724 x 724, 130 MB of cells."""

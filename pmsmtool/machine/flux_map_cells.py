@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pmsmtool import native
+from pmsmtool.arrays import Array
 
 Kind = Literal["bicubic", "bilinear"]
 KINDS: dict[Kind, int] = {"bicubic": 0, "bilinear": 1}
@@ -32,7 +33,6 @@ EQUIDISTANT_TOLERANCE = 1e-9
 """Deviation of a node, in steps, up to which an axis counts as equidistant (moves a value by 1e-9 of a
 cell's change; ``numpy.linspace`` stays below 1e-13)."""
 
-Array = NDArray[np.float64]
 _STRUCTS = native.parse_structs(
     Path(__file__).with_name("flux_map.h").read_text(encoding="ascii"), {"double*": ctypes.POINTER(ctypes.c_double)}
 )

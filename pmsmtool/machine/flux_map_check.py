@@ -16,11 +16,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.machine.flux_map import FluxMap, jacobian_samples
-
-Array = NDArray[np.float64]
 
 RECIPROCITY_LIMIT = 0.002
 """Largest accepted distance (rms, of the flux range) to the nearest reciprocal map. Measured: 0.0002 on a carefully

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
 from pmsmtool.machine.flux_map import INVERSE_NODES, FluxMap, meta_json
@@ -33,7 +34,6 @@ from pmsmtool.units import parse_quantity
 
 NEXT_STEP = "`pmsmtool machine map FILE` checks and repairs a map; `pmsmtool help files` says what it may be"
 
-Array = NDArray[np.float64]
 
 MESH_TOLERANCE = 1e-6
 """Largest deviation, of the axis range, of a current grid from a true rectangle."""

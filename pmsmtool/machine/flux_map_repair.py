@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_check import flux_range, reciprocal_change
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

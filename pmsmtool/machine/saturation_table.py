@@ -13,9 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.machine.flux_map import FluxMap
-
-Array = NDArray[np.float64]
 
 NODES_D, NODES_Q = 7, 7
 """784 bytes. Nodes 5 x 5, 9 x 9 and 17 x 33 settle alike (median within 10 %), 4 x 4 takes half as long again on

@@ -11,12 +11,10 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
-
-Array = NDArray[np.float64]
 
 DAMPING = 0.01
 """Damping of a resonance whose machine file says none: the lower end of 0.5 to 5 % (steel shaft to jaw coupling)."""

@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
@@ -41,7 +41,6 @@ SAY_S = 1.0
 LOOK_S = 0.05
 """While the drive sends by itself, its supervision is looked at this often."""
 
-Array = NDArray[np.float64]
 Say = Callable[[str], None]
 
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.loops.current_loop import imc
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.encoder import EncoderResult
@@ -26,7 +26,6 @@ from pmsmtool.measurement.mechanics import numbered
 from pmsmtool.trace import Trace
 from pmsmtool.units import rpm_from_rad_s
 
-Array = NDArray[np.float64]
 EMF_SHARE = 0.8
 """Largest speed of the flux run: back-emf of this share of the largest voltage."""
 RUN_BANDWIDTH_RAD_S = 2.0 * math.pi * 120.0

@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from pmsmtool.arrays import Array
 from pmsmtool.cia402 import Mode
 from pmsmtool.design.closed_drive import RATED, SLOPE, TORQUE, ClosedDrive, Guarantee, tune_closed
 from pmsmtool.design.design_file import Design
@@ -23,7 +24,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.papers.figure import Array, Check, Column, Panel, Reproduction, Series, Table, at_least, at_most
+from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, at_least, at_most
 from pmsmtool.papers.registry import OURS
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.drive_kernel import KernelCore

@@ -11,10 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from pmsmtool.arrays import Array
 
 Cell = str | int | float | None
 """Entry of a table; None and NaN are shown as "-"."""

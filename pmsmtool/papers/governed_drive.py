@@ -15,13 +15,13 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.papers.figure import Array
 from pmsmtool.sim.kernel import Application, Rotor, Setup, Simulation, Target
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.signals import Signal, Truth

@@ -7,9 +7,10 @@ import math
 
 import numpy as np
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.admissible_set import Horizon, PredictionModel, StateBounds, horizon
 from pmsmtool.design.loops.current_loop import CurrentGains, imc, second_order
-from pmsmtool.papers.figure import Array, Check, Column, Reproduction, Table, at_most, near
+from pmsmtool.papers.figure import Check, Column, Reproduction, Table, at_most, near
 from pmsmtool.papers.governed_drive import MODULUS_OPTIMUM, V_max, source
 from pmsmtool.papers.registry import JERCIC
 from pmsmtool.sim.simulated_machine import RPM

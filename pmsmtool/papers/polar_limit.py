@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pmsmtool.arrays import Array
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, at_most, near
 from pmsmtool.papers.polar_measures import peak_current_apk, settling_ms
@@ -30,7 +31,6 @@ from pmsmtool.papers.polar_scene import (
     UNIFIED_TUNED,
     V_DC,
     V_MAX,
-    Array,
     Controller,
     Response,
     machine_file,

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pmsmtool.papers.polar_scene import K_T, PEAK, Array, Response, machine_file
+from pmsmtool.arrays import Array
+from pmsmtool.papers.polar_scene import K_T, PEAK, Response, machine_file
 
 BAND = 0.05
 """Settling band as a share of the step."""

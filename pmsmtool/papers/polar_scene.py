@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.polar_laws import LAWS, LINEAR_RANGE, NO_ANTI_WINDUP, ON_MEASUREMENT, PREDICT
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
@@ -25,8 +25,6 @@ from pmsmtool.sim.closed_loop import simulate
 from pmsmtool.sim.kernel import Application
 from pmsmtool.sim.scenarios import Profile, Scenario
 from pmsmtool.units import rpm_from_rad_s
-
-Array = NDArray[np.float64]
 
 PROFILE = "miyajima-2013-assumed"
 SOURCE = "Miyajima, Fujimoto, Fujitsuna 2013; expected numbers re-derived, Table I is assumed"

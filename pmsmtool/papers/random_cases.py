@@ -10,8 +10,8 @@ from functools import cache
 
 import numpy as np
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.minimum_time import TransferProblem, minimum_time
-from pmsmtool.papers.figure import Array
 from pmsmtool.papers.governed_drive import GovernedDrive, Plant, V_max, plant_of, source
 from pmsmtool.papers.statistics import BAND, settling_s
 from pmsmtool.sim.simulated_machine import RPM

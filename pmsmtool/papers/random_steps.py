@@ -10,18 +10,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.governor import EPS_LEAST
-from pmsmtool.papers.figure import (
-    Array,
-    Cell,
-    Check,
-    Column,
-    Panel,
-    Reproduction,
-    Series,
-    Table,
-    at_most,
-)
+from pmsmtool.papers.figure import Cell, Check, Column, Panel, Reproduction, Series, Table, at_most
 from pmsmtool.papers.governed_drive import (
     DELAYED,
     FAST,

@@ -9,20 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.governor import EPS_LEAST
 from pmsmtool.design.minimum_time import minimum_time
 from pmsmtool.papers.current_step import transfer
-from pmsmtool.papers.figure import (
-    Array,
-    Check,
-    Column,
-    Panel,
-    Reproduction,
-    Series,
-    Table,
-    at_least,
-    at_most,
-)
+from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, at_least, at_most
 from pmsmtool.papers.governed_drive import (
     DELAYED,
     FLAG_FALLBACK,

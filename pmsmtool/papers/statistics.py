@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pmsmtool.papers.figure import Array, Column, Table
+from pmsmtool.arrays import Array
+from pmsmtool.papers.figure import Column, Table
 
 RESAMPLES = 2000
 """Bootstrap resamples; the ends of a 95 % interval then stand on 50 of them each."""

@@ -9,19 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.field_weakening import overshoot_per_slope
-from pmsmtool.papers.figure import (
-    Array,
-    Check,
-    Column,
-    Panel,
-    Reproduction,
-    Series,
-    Table,
-    as_printed,
-    at_most,
-    near,
-)
+from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, as_printed, at_most, near
 from pmsmtool.papers.governed_drive import (
     MODULUS_OPTIMUM,
     NOMINAL,

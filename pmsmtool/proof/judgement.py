@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pmsmtool.design.prediction import Array, Band, Prediction, Quantity
+from pmsmtool.arrays import Array
+from pmsmtool.design.prediction import Band, Prediction, Quantity
 from pmsmtool.errors import ConfigError
 from pmsmtool.trace import Trace
 

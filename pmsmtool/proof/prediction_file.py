@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.design.prediction import Array, Band, Fault, Prediction, Quantity
+from pmsmtool.arrays import Array
+from pmsmtool.design.prediction import Band, Fault, Prediction, Quantity
 from pmsmtool.errors import ConfigError, next_step
 
 NEXT_STEP = "prove again: the prediction beside the traces was damaged"

@@ -17,8 +17,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design
-from pmsmtool.design.prediction import Array, Direction, Prediction, Runs, predict
+from pmsmtool.design.prediction import Direction, Prediction, Runs, predict
 from pmsmtool.design.tolerance import Samples, tolerance_box
 from pmsmtool.drive.port import Excitation, Injection
 from pmsmtool.estimators.resistance import at_the_test

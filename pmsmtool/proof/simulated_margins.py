@@ -17,6 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
+from pmsmtool.arrays import Array
 from pmsmtool.cia402 import error_text
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.loops.margins import JUDGED_PERCENTILE, PERCENTILES, MarginRequest
@@ -24,7 +25,7 @@ from pmsmtool.design.tolerance import Samples, ToleranceBox
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import drive_values
-from pmsmtool.sim.monte_carlo import Array, DriveRuns, Variation, cores, simulate_many
+from pmsmtool.sim.monte_carlo import DriveRuns, Variation, cores, simulate_many
 from pmsmtool.sim.scenarios import Scenario, built_in
 from pmsmtool.units import rad_s_from_rpm
 

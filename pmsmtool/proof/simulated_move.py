@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pmsmtool.design.prediction import Array
+from pmsmtool.arrays import Array
 from pmsmtool.proof.plan import Experiment
 from pmsmtool.sim.kernel import Part, Simulation
 from pmsmtool.sim.node.drive_core import ControlMode, RecorderState, Trigger

@@ -19,8 +19,9 @@ from typing import Any
 
 import numpy as np
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design
-from pmsmtool.design.prediction import Array, Prediction
+from pmsmtool.design.prediction import Prediction
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.loops.margins import MarginReport
 from pmsmtool.design.loops.sampled_loop import LoopMargins, SampledLoop
 from pmsmtool.design.prediction import Prediction
@@ -28,7 +29,6 @@ from pmsmtool.trace import Trace
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-Vector = NDArray[np.float64]
 
 _BAND = "#e5e7eb"
 _SALT = "pmsmtool"
@@ -217,7 +217,7 @@ def nyquist_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMar
 
 
 def margin_map_figure(
-    inductance: Vector, delay: Vector, phase_deg: NDArray[np.float64], designed: tuple[float, float], caption: str
+    inductance: Array, delay: Array, phase_deg: NDArray[np.float64], designed: tuple[float, float], caption: str
 ) -> Figure:
     """Draw the phase margin of a current loop over an inductance and a delay that differ from the design.
 
@@ -246,9 +246,9 @@ def margin_map_figure(
 
 
 def envelope_figure(
-    speed_rpm: Vector,
-    largest_nm: Vector,
-    lines: Mapping[str, tuple[Vector, Vector]],
+    speed_rpm: Array,
+    largest_nm: Array,
+    lines: Mapping[str, tuple[Array, Array]],
     I_max_apk: float,
     binding: Sequence[str] = (),
 ) -> Figure:
@@ -377,9 +377,9 @@ _SIGNAL_LABELS = {"i_d_a": "i_d / A", "i_q_a": "i_q / A", "omega_e_rad_s": "spee
 def proof_figure(
     prediction: Prediction,
     experiment: str,
-    measured: Mapping[str, Vector],
+    measured: Mapping[str, Array],
     caption: str,
-    fastest: tuple[Vector, Mapping[str, Vector]] | None = None,
+    fastest: tuple[Array, Mapping[str, Array]] | None = None,
 ) -> Figure:
     """Draw the measured response of one experiment over its predicted band.
 

@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pmsmtool import native
+from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.core_binding import APPLICATION_HEADER, CORE_HEADERS, HEADER_FOLDER
 from pmsmtool.machine.flux_map_cells import FluxMapStruct
-
-Array = NDArray[np.float64]
 
 _f32, _f64, _u32, _u64 = ctypes.c_float, ctypes.c_double, ctypes.c_uint32, ctypes.c_uint64
 

@@ -18,14 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.machine.flux_map import FluxScale, ScalableMap
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import open_simulation
 from pmsmtool.sim.kernel import STRUCTS, Setup, library
 from pmsmtool.sim.scenarios import Scenario
-
-Array = NDArray[np.float64]
 
 THREADS_MAX = 64
 """``PMSM_MONTE_CARLO_THREADS_MAX``."""

@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.lookup.grid import (
     GridBounds,
     InterpolationError,
@@ -37,8 +37,6 @@ from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.saturation_table import NODES_D, NODES_Q
 from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS, SATURATION_VALUES
-
-Array = NDArray[np.float64]
 
 FIRST_TORQUES, FIRST_SPEEDS = 17, 13
 """Nodes of the axes that refinement starts from."""

@@ -16,12 +16,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.lookup.table import RPM, LookupTable, torque_limits
 from pmsmtool.design.operating_machine import design_library
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS
 
-Array = NDArray[np.float64]
 StoredFormat = Literal["float32", "int16"]
 
 POINTS_PER_INTERVAL = 16

@@ -7,12 +7,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.lookup.table import VOLTAGE, LookupTable, electrical_speed, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
-
-Array = NDArray[np.float64]
 
 BEYOND_CURRENT = 10.0
 """The MTPV locus is sought with this multiple of I_max (a constant machine; a map ends at its own edge)."""

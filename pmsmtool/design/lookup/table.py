@@ -16,11 +16,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.operating_machine import OperatingMachine, design_library
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.units import RPM_PER_RAD_S
 
-Array = NDArray[np.float64]
 AxisKind = Literal["speed", "flux"]
 
 CURRENT, VOLTAGE, DEMAGNETISATION, MAP, CUT, NONE = 1, 2, 4, 8, 16, 32

@@ -14,12 +14,10 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.loops.sampled_loop import SampledLoop
 from pmsmtool.errors import DesignInfeasible
-
-Array = NDArray[np.float64]
 
 HOLD_PERIODS = 0.5
 """Mean delay of the zero-order hold itself, in periods."""

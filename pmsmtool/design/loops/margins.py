@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.headroom import Headroom, HeadroomLimits, OperatingCells, headroom, operating_cells
 from pmsmtool.design.loops.bandwidth import least_inductance
@@ -35,8 +36,6 @@ from pmsmtool.design.tolerance import Samples, ToleranceBox
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 from pmsmtool.plain_text import table
-
-Array = NDArray[np.float64]
 
 BLOCK = 2048
 """Random samples of one block (40 ms of work); fixed, because it decides the numbers."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pmsmtool.arrays import Array
 
 _REAL_ROOT = 1e-6
 """Largest |imaginary part| of a root in c taken as real; double roots of degree <= 12 scatter by about 1e-8."""

@@ -17,13 +17,12 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.two_masses import Mechanics, sampled
 
-Array = NDArray[np.float64]
 System = tuple[Array, Array, Array, float]
 """A, b, c, d of a single-input single-output system, x(k+1) = A x + b u, y = c x + d u."""
 

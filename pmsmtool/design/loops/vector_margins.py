@@ -13,13 +13,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array, Complex
 from pmsmtool.design.loops.current_loop import HOLD_PERIODS, CurrentGains
 from pmsmtool.design.loops.sampled_loop import SampledLoop
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 Response = Callable[[Array], Complex]
 """Loop of n machines at frequencies (rad/s) of shape (m,) or (n, m); returns shape (n, m)."""
 

@@ -11,9 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pmsmtool.arrays import Array
 
 DEGREE = 4
 SPACING_D, SPACING_Q = 1.4, 1.6

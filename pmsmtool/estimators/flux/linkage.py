@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.cross_check import cross_check, driven_flux_linkage
 from pmsmtool.estimators.estimate import SensorTolerance, condition_gate, information_weights
 from pmsmtool.estimators.flux.linkage_rows import STAGE, Corrected, check_speeds, corrected, fastest_pair, pairs_of
@@ -35,8 +36,6 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.trace import Trace
-
-Vector = NDArray[np.float64]
 
 RELATIVE_FLOOR = 7e-5
 """Relative model floor of psi, one standard deviation: 24 drives with samples in time are 0.020 % off in the
@@ -118,8 +117,8 @@ class FluxResult:
     low_wb: float
     low_std_wb: float
     low_i_d_a: float
-    omega_rad_s: Vector
-    residual_wb: Vector
+    omega_rad_s: Array
+    residual_wb: Array
     shown: ShownInstant | None = None
     apart_wb: float = 0.0
 
@@ -319,7 +318,7 @@ def check_magnet(before: Trace, again: Trace, flux: FluxResult, alpha_psi_per_k:
         )
 
 
-def _fit_d(rows: Corrected) -> tuple[Vector, Vector, int]:
+def _fit_d(rows: Corrected) -> tuple[Array, Array, int]:
     """Regress u_d; returns (L_q, x2, psi dt, ...), their standard deviations and the degrees of freedom.
 
     In a frame eps ahead of the d axis u_d has w eps times all of psi_d: with i_d^2 and i_q^2, where it saturates.
@@ -352,11 +351,11 @@ class _Even:
     low_wb: float
     low_std_wb: float
     low_i_d_a: float
-    w: Vector
-    residual_wb: Vector
-    row: Vector
+    w: Array
+    residual_wb: Array
+    row: Array
 
-    def change(self, voltage_v: Vector) -> float:
+    def change(self, voltage_v: Array) -> float:
         """Change of the flux that a q voltage of every row makes (Wb)."""
         return float(self.row @ voltage_v)
 

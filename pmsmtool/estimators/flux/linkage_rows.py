@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.injection.sampling_instant import Sampling, course_s2, sampled_ripple
 from pmsmtool.estimators.injection.switching_ripple import Modulation, rippled_error_dq_v
 from pmsmtool.estimators.inverter_error import InverterCurve
@@ -17,7 +18,6 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "flux linkage"
-Vector = NDArray[np.float64]
 
 MINIMUM_PAIRS = 4
 """Pairs of d currents in each direction."""
@@ -57,14 +57,14 @@ class Corrected:
         Rows with a d current.
     """
 
-    w: Vector
-    acceleration_rad_s2: Vector
-    i_d: Vector
-    i_q: Vector
-    u_d: Vector
-    u_q: Vector
-    ripple_q_v: Vector
-    curve_q_v: Vector
+    w: Array
+    acceleration_rad_s2: Array
+    i_d: Array
+    i_q: Array
+    u_d: Array
+    u_q: Array
+    ripple_q_v: Array
+    curve_q_v: Array
     is_d: NDArray[np.bool_]
 
 
@@ -149,8 +149,8 @@ def corrected(
 
 def mean_inverter_error(
     curve: InverterCurve,
-    current: tuple[Vector, Vector],
-    voltage: tuple[Vector, Vector] | None = None,
+    current: tuple[Array, Array],
+    voltage: tuple[Array, Array] | None = None,
     modulation: Modulation | None = None,
 ) -> NDArray[np.float64]:
     """Mean of the three-phase error over one electrical turn in the rotor frame (V), shape (2, n).
@@ -204,7 +204,7 @@ def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]]) -> None:
 
 
 def _check_settled(
-    w: Vector, moved: Vector, limit: float, what: str, unit: str, likely: str = "", hint: str = ""
+    w: Array, moved: Array, limit: float, what: str, unit: str, likely: str = "", hint: str = ""
 ) -> None:
     worst = int(np.argmax(moved))
     if moved[worst] > limit:

@@ -13,8 +13,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
 from pmsmtool.estimators.flux.map_rows import (
     KNEES,
@@ -28,8 +28,6 @@ from pmsmtool.estimators.flux.map_rows import (
 )
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
 
 PIECES = (15, 17)
 """Break points along i_d and i_q. On the measured PM-SyRM map the spline's own floor is below 0.03 % of the range."""

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.map_fit import CoenergyFit, MagnetFlux, fit_coenergy
@@ -22,8 +23,6 @@ from pmsmtool.machine.flux_map import FluxMap, require_monotonic
 from pmsmtool.machine.flux_map_check import reciprocal_change
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
 
 STAGE = "flux map"
 NODES = 41

@@ -15,13 +15,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
 
 SEGMENT = 150
 """Samples that share one constant: long enough for a pulse, short enough for what R and inverter leave to add up."""

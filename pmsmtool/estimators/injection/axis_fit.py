@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.estimate import CHI2_WARN, information_weights, scaled_covariance
 from pmsmtool.estimators.injection.axis_layout import Effects, Layout, Motion, Timing
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, arx_guess, projected, simulate
@@ -27,8 +28,6 @@ from pmsmtool.estimators.injection.output_error import respond
 from pmsmtool.estimators.injection.sampling_instant import ShownInstant
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt
 from pmsmtool.estimators.refusals import refuse
-
-Vector = NDArray[np.float64]
 
 DISPERSION_SHARE = 0.5
 """Standard deviation of L, of its difference between the injection frequencies where the fit found one."""
@@ -102,7 +101,7 @@ class AxisFit:
     motion_per_f: float
     chi2: float
     n: int
-    residuals: tuple[Vector, ...]
+    residuals: tuple[Array, ...]
     effects: tuple[str, ...]
     condition: float
     timing: Timing
@@ -124,20 +123,20 @@ class _Problem:
     def rows(self) -> int:
         return sum(len(shot.i_a) - SKIP_SAMPLES for shot in self.shots)
 
-    def per_shot(self, x: Vector) -> list[Vector]:
+    def per_shot(self, x: Array) -> list[Array]:
         out = []
         for shot, slow, response in zip(self.shots, self.slow, self.layout.responses(x), strict=True):
             r = (simulate([response], shot, slow)[0] - shot.i_a[SKIP_SAMPLES:]) / self.sigma_a
             out.append(projected(r, slow))
         return out
 
-    def __call__(self, x: Vector) -> Vector:
+    def __call__(self, x: Array) -> Array:
         prior = self.layout.prior(x)
         if not self.layout.defined(x):
             return np.full(self.rows + len(prior), UNPHYSICAL)
         return np.concatenate([*self.per_shot(x), prior])
 
-    def derivative(self, x: Vector) -> NDArray[np.float64]:
+    def derivative(self, x: Array) -> NDArray[np.float64]:
         """Jacobian: differences for what shots share, the decay of a starting current in closed form.
 
         One-sided: a step of 1e-5 leaves 1e-5 of a column, and central ones would double the time of a fit. All columns
@@ -167,7 +166,7 @@ class _Problem:
             first += len(slow)
         return out
 
-    def fit(self, x: Vector, iterations: int = ITERATIONS) -> Fit:
+    def fit(self, x: Array, iterations: int = ITERATIONS) -> Fit:
         with np.errstate(over="ignore", invalid="ignore"):  # a step that runs away has no finite cost and is refused
             return levenberg_marquardt(
                 self,
@@ -291,7 +290,7 @@ def _criterion(fit: Fit, layout: Layout, timing: Timing | None) -> float:
 
 def _timing(tried: dict[Effects, tuple[Fit, Layout]]) -> Timing:
     """Delay and lag of the best models with and without lag."""
-    best: dict[bool, tuple[float, Vector, NDArray[np.float64]]] = {}
+    best: dict[bool, tuple[float, Array, NDArray[np.float64]]] = {}
     for effects, (fit, layout) in tried.items():
         criterion = _criterion(fit, layout, None)
         if effects.lag not in best or criterion < best[effects.lag][0]:

@@ -8,13 +8,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Response
 from pmsmtool.estimators.injection.output_error import AxisModel
 from pmsmtool.estimators.injection.sampling_instant import ShownInstant
-
-Vector = NDArray[np.float64]
 
 DELAY_CENTRE, DELAY_PRIOR_STD = 1.0, 1.0
 """Sample to voltage (T_s). A sample within a zero vector does not show it: nothing kept it, and L had 48 %."""
@@ -146,7 +144,7 @@ class Layout:
             yield "eddy", 2
         yield "start", self.shots
 
-    def split(self, x: Vector) -> dict[str, list[float]]:
+    def split(self, x: Array) -> dict[str, list[float]]:
         """The parts of the vector by name."""
         parts, first = {}, 0
         for name, length in self.blocks():
@@ -154,7 +152,7 @@ class Layout:
             first += length
         return parts
 
-    def responses(self, x: Vector) -> list[Response]:
+    def responses(self, x: Array) -> list[Response]:
         """Parameters of every shot."""
         parts = self.split(x)
         log_L, R, delay = parts["main"]
@@ -181,7 +179,7 @@ class Layout:
             for k in range(self.shots)
         ]
 
-    def prior(self, x: Vector) -> Vector:
+    def prior(self, x: Array) -> Array:
         """Residuals of the weak priors that keep an undetermined effect from running away."""
         parts = self.split(x)
         rows = [(parts["main"][1] - 1.0) / (EDDY_R_PRIOR_STD if self.effects.eddy else R_PRIOR_STD)]
@@ -205,7 +203,7 @@ class Layout:
             rows += [eddy / EDDY_PRIOR_STD, (log_tau - math.log(EDDY_TAU_CENTRE)) / EDDY_TAU_PRIOR_STD]
         return np.array(rows)
 
-    def changed(self, x: Vector, effects: Effects) -> tuple[Layout, Vector]:
+    def changed(self, x: Array, effects: Effects) -> tuple[Layout, Array]:
         """The layout with more effects, or without the lag, and its starting vector."""
         richer = replace(self, effects=effects)
         parts = self.split(x)
@@ -221,7 +219,7 @@ class Layout:
         values = [value for name, _ in richer.blocks() for value in parts.get(name, start.get(name, []))]
         return richer, np.array(values)
 
-    def with_eddy(self, x: Vector, eddy: float, tau: float, delay: float | None) -> Vector:
+    def with_eddy(self, x: Array, eddy: float, tau: float, delay: float | None) -> Array:
         """Return the vector with an eddy branch (T_s/L, T_s), a delay (T_s; None: its own), and no loss beside it."""
         parts = self.split(x)
         parts["main"][1] = 1.0
@@ -230,7 +228,7 @@ class Layout:
             parts["main"][2] = delay
         return np.array([value for name, _ in self.blocks() for value in parts[name]])
 
-    def defined(self, x: Vector) -> bool:
+    def defined(self, x: Array) -> bool:
         """Whether the model can be evaluated at x."""
         parts = self.split(x)
         (log_L, _, delay), log_lag = parts["main"], parts.get("lag", [0.0])[0]

@@ -10,10 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.injection.output_error import AxisModel, Pulses, bend, eddy_current, recursion, respond
 from pmsmtool.estimators.refusals import refuse
-
-Vector = NDArray[np.float64]
 
 SKIP_SAMPLES = 10
 """First samples that are simulated but not compared: the voltage before the record and the sensor's start."""
@@ -44,9 +43,9 @@ class VoltageError:
         Errors of the legs that take current in, and of those that feed it out (V).
     """
 
-    i_a: Vector
-    early_v: Vector
-    late_v: Vector
+    i_a: Array
+    early_v: Array
+    late_v: Array
 
     def lost_v(self, i_a: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean error in each interval between samples of currents (V), shape (..., n - 1)."""
@@ -84,9 +83,9 @@ class Shot:
         Frequencies that are not the injection's and count as slow: ripple of the DC link.
     """
 
-    u_v: Vector
-    i_a: Vector
-    cross_a: Vector
+    u_v: Array
+    i_a: Array
+    cross_a: Array
     half_period: int
     period_s: float
     error: VoltageError | None = None
@@ -195,7 +194,7 @@ def _fast_charge(fast: NDArray[np.float64], slow: NDArray[np.float64], T_s: floa
     return charge
 
 
-def with_line(shot: Shot, residual: Vector) -> Shot:
+def with_line(shot: Shot, residual: Array) -> Shot:
     """Return the shot with the frequency of a sine that most of a fit's residual is; the same where it is none.
 
     The ripple of a DC link is a voltage that the drive does not know. What lies on the injection's harmonics stays.

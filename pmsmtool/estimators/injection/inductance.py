@@ -16,8 +16,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, Verdict, chi2_gate, condition_gate
 from pmsmtool.estimators.injection.angle_dependence import UNSEEN_RANGE, AngleDependence, over_angle
@@ -32,8 +32,6 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.position import position_noise
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
-
-Vector = NDArray[np.float64]
 
 MODEL_FLOOR = 1e-4
 """Relative standard deviation added for what the model leaves out.
@@ -369,7 +367,7 @@ def _widening(fit: AxisFit, shots: Sequence[Shot], sigma_a: float, stage: str) -
     return Verdict.WARN, math.sqrt(fit.chi2), max(shares)
 
 
-def _in_step(residual: Vector, period: int) -> float:
+def _in_step(residual: Array, period: int) -> float:
     """Part of a residual's power that repeats with a period (samples)."""
     count = len(residual) // period
     mean = residual[: count * period].reshape(count, period).mean(axis=0)
@@ -436,7 +434,7 @@ def _pulse_height(frame_rad: float, axis: str, U_dc_v: float) -> float:
     return U_dc_v / float(np.ptp(legs))
 
 
-def _check_rotor(theta_e: Vector, stage: str) -> None:
+def _check_rotor(theta_e: Array, stage: str) -> None:
     moves = np.abs(np.diff(theta_e))
     moves = moves[moves > 1e-9]
     step = float(np.min(moves)) if len(moves) else 0.0

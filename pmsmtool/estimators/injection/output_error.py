@@ -21,7 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Vector = NDArray[np.float64]
+from pmsmtool.arrays import Array
+
 FAST_POLE = 0.6
 """Poles up to this are summed by their impulse response, at most 82 taps."""
 BLOCK_LOSS = 7.0
@@ -91,12 +92,12 @@ class Pulses:
         Constant voltage beside them (V): minus the mean of the commands.
     """
 
-    share: Vector
-    height_v: Vector
+    share: Array
+    height_v: Array
     rest_v: float
 
 
-def recursion(pole: float, drive: Vector, start: float) -> Vector:
+def recursion(pole: float, drive: Array, start: float) -> Array:
     """Return x with x[0] = start and x[k+1] = pole x[k] + drive[k]; shape (n + 1,) for drive of shape (n,).
 
     Slow poles by scaled running sums in blocks that lose at most three digits, fast ones by their short impulse
@@ -127,7 +128,7 @@ def recursion(pole: float, drive: Vector, start: float) -> Vector:
     return out[: n + 1]
 
 
-def acting_voltages(command: Vector, delay: float) -> tuple[Vector, Vector, float]:
+def acting_voltages(command: Array, delay: float) -> tuple[Array, Array, float]:
     """Split the voltage acting between two samples into its two constant parts.
 
     Parameters
@@ -175,7 +176,7 @@ def _advance(model: AxisModel, h: float) -> tuple[float, float, float, float, fl
     return a, b, e, c, (1.0 - e - c) * conductance_ratio
 
 
-def respond(model: AxisModel, command: Vector, period_s: float, start_a: float, pulses: Pulses | None = None) -> Vector:
+def respond(model: AxisModel, command: Array, period_s: float, start_a: float, pulses: Pulses | None = None) -> Array:
     """Measured current from the first modelled sample on, shape (n - first + 1,), in equilibrium at ``start_a``.
 
     Parameters
@@ -205,7 +206,7 @@ def respond(model: AxisModel, command: Vector, period_s: float, start_a: float, 
     return recursion(e_1 * e_2, forced, start_a)
 
 
-def eddy_current(model: AxisModel, command: Vector, period_s: float) -> Vector:
+def eddy_current(model: AxisModel, command: Array, period_s: float) -> Array:
     """Current of the eddy branch (A) at the samples of :func:`respond`: flux, less what has got through, over L.
 
     The voltage counts as constant over each command's period, and its resistive part as none of it.
@@ -218,7 +219,7 @@ def eddy_current(model: AxisModel, command: Vector, period_s: float) -> Vector:
     return np.asarray(slope * (model.eddy_s / model.L_h))
 
 
-def _respond_to_pulses(model: AxisModel, pulses: Pulses, period_s: float, start_a: float) -> Vector:
+def _respond_to_pulses(model: AxisModel, pulses: Pulses, period_s: float, start_a: float) -> Array:
     """As :func:`respond`, every edge of a pulse at its own time."""
     early_v, late_v, fraction = acting_voltages(pulses.height_v, model.delay)
     early_w, late_w, _ = acting_voltages(pulses.share, model.delay)
@@ -233,7 +234,7 @@ def _respond_to_pulses(model: AxisModel, pulses: Pulses, period_s: float, start_
     return recursion(e, c * current[:-1] + forced[1], start_a)
 
 
-def _charged(model: AxisModel, share: Vector, gone: float, period_s: float) -> NDArray[np.float64]:
+def _charged(model: AxisModel, share: Array, gone: float, period_s: float) -> NDArray[np.float64]:
     """Current and sensor output at an interval's end per volt of two pulses, shape (2, n).
 
     The interval begins ``gone`` periods after the pulses' own period. What a pulse does depends smoothly on its width
@@ -257,7 +258,7 @@ def _charged(model: AxisModel, share: Vector, gone: float, period_s: float) -> N
     return out
 
 
-def _charged_exactly(model: AxisModel, share: Vector, gone: float, period_s: float) -> NDArray[np.float64]:
+def _charged_exactly(model: AxisModel, share: Array, gone: float, period_s: float) -> NDArray[np.float64]:
     # rising and falling edges from the sample on, in periods: the interval is 0 ... 1
     edges = PULSE_EDGES[:, :1] + PULSE_EDGES[:, 1:] * share - gone
     risen = _stepped(model, (1.0 - np.clip(edges, 0.0, 1.0)) * period_s)

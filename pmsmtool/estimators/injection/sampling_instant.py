@@ -23,9 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.injection.switching_ripple import LEG_ANGLES, Modulation, duties, phases_of
-
-Vector = NDArray[np.float64]
 
 ANGLES = 12
 """Angles over which the ripple is averaged: a sixth of a turn, after which three equal phases repeat."""
@@ -61,7 +60,7 @@ class Sampling:
 
 
 def sampled_ripple(
-    voltage: tuple[Vector, Vector], current: tuple[Vector, Vector], modulation: Modulation, sampling: Sampling
+    voltage: tuple[Array, Array], current: tuple[Array, Array], modulation: Modulation, sampling: Sampling
 ) -> NDArray[np.float64]:
     """Sampled current beyond the mean of the period, from the pulses of the legs (A), shape (2, n).
 
@@ -97,7 +96,7 @@ def sampled_ripple(
     return np.asarray(np.stack([d, q]).reshape(2, n, ANGLES).mean(axis=2))
 
 
-def _lagging(on: NDArray[np.float64], off: NDArray[np.float64], t: float, lag_s: float, T_s: float) -> Vector:
+def _lagging(on: NDArray[np.float64], off: NDArray[np.float64], t: float, lag_s: float, T_s: float) -> Array:
     """Periodic pulses of height 1 behind a first-order lag, at a time before the end of the first one."""
     before = (np.exp(-(t + T_s - off) / lag_s) - np.exp(-(t + T_s - on) / lag_s)) / -math.expm1(-T_s / lag_s)
     during = np.exp(-np.maximum(0.0, t - off) / lag_s) - np.exp(-np.maximum(0.0, t - on) / lag_s)
@@ -191,12 +190,12 @@ class CoastingPairs:
         Rows with d currents of both signs.
     """
 
-    w: Vector
-    u_d: Vector
-    i_d: Vector
-    i_q: Vector
-    v_d: Vector
-    v_q: Vector
+    w: Array
+    u_d: Array
+    i_d: Array
+    i_q: Array
+    v_d: Array
+    v_q: Array
     pairs: Sequence[tuple[int, int]]
 
 
@@ -230,7 +229,7 @@ def shown_instant(
     if len(first) < 5:
         return None
 
-    def even(values: Vector) -> Vector:
+    def even(values: Array) -> Array:
         return np.asarray(0.5 * (values[first] + values[second]))
 
     L_d, L_q = modulation.L_h

@@ -25,9 +25,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.inverter_error import InverterCurve
 
-Vector = NDArray[np.float64]
 ROOT_3 = math.sqrt(3.0)
 LEG_ANGLES = 2.0 * math.pi / 3.0 * np.arange(3.0)
 
@@ -68,7 +68,7 @@ class Modulation:
         return self.dead_time_s * self.U_dc_v / self.period_s
 
 
-def phases_of(d: Vector, q: Vector, theta_rad: Vector) -> NDArray[np.float64]:
+def phases_of(d: Array, q: Array, theta_rad: Array) -> NDArray[np.float64]:
     """Phase quantities, shape (3, n), of a vector in a frame at ``theta_rad``."""
     angle = theta_rad - LEG_ANGLES[:, None]
     return np.asarray(np.cos(angle) * d - np.sin(angle) * q)
@@ -97,7 +97,7 @@ def edge_curve(curve: InverterCurve, modulation: Modulation) -> InverterCurve:
 
 
 def ripple_at_edges(
-    on_s: NDArray[np.float64], off_s: NDArray[np.float64], theta_rad: Vector, modulation: Modulation
+    on_s: NDArray[np.float64], off_s: NDArray[np.float64], theta_rad: Array, modulation: Modulation
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Current of each leg beyond its value at the period's ends, at the leg's own rising and falling edge (A).
 
@@ -129,11 +129,11 @@ def ripple_at_edges(
 
 def rippled_error_dq_v(
     curve: InverterCurve,
-    current: tuple[Vector, Vector],
-    voltage: tuple[Vector, Vector],
-    theta_rad: Vector,
+    current: tuple[Array, Array],
+    voltage: tuple[Array, Array],
+    theta_rad: Array,
     modulation: Modulation,
-) -> tuple[Vector, Vector]:
+) -> tuple[Array, Array]:
     """Error of the three phases in the rotor frame with the ripple at their edges (V).
 
     Parameters

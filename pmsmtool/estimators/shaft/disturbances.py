@@ -27,11 +27,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS
-
-Array = NDArray[np.float64]
 
 TILT_FLOOR = 2e-3
 """Relative deviation of the pushes' torque at their fastest speed, beyond that of the samples' displacement. Fits of

@@ -24,15 +24,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array, Complex
 from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, information_bound, scaled_covariance
 from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, STAGE, local_polynomials, transforms
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 RECORDS_LEAST = 3
 """Records below which a line's noise is not known."""

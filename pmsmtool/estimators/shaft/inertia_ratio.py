@@ -17,15 +17,14 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.estimate import CONDITION_LIMIT, SensorTolerance, statistical_half_width
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace
 
-Vector = NDArray[np.float64]
 Push = TypeVar("Push")
 
 STAGE = "inertia over flux linkage"
@@ -93,7 +92,7 @@ def estimate_ratios(
     return found
 
 
-def _part(push: Trace) -> tuple[Vector, Vector, Vector, Vector, Vector] | None:
+def _part(push: Trace) -> tuple[Array, Array, Array, Array, Array] | None:
     """Return speed, integrals of current, of the sign of speed and of speed, and time, at the blocks of a push."""
     skip = round(SKIP_SHARE * len(push))
     size = (len(push) - skip) // BLOCKS
@@ -119,7 +118,7 @@ def _part(push: Trace) -> tuple[Vector, Vector, Vector, Vector, Vector] | None:
     return w[moving], q[moving], signs[moving], way[moving], (middle - t[0])[moving]
 
 
-def _ratios(parts: Sequence[tuple[Vector, ...]], sense: float, pole_pairs: int) -> Vector:
+def _ratios(parts: Sequence[tuple[Array, ...]], sense: float, pole_pairs: int) -> Array:
     """Return J/psi and tau_c/psi; the constants of the pushes are projected out."""
     columns = [np.concatenate([part[k] - part[k].mean() for part in parts]) for k in (1, 2, 3)]
     w = np.concatenate([part[0] - part[0].mean() for part in parts])
@@ -132,7 +131,7 @@ def _ratios(parts: Sequence[tuple[Vector, ...]], sense: float, pole_pairs: int) 
     return np.array([ratio, friction * ratio])
 
 
-def regress(columns: Sequence[Vector], measured: Vector, *, what: str, stage: str) -> Vector:
+def regress(columns: Sequence[Array], measured: Array, *, what: str, stage: str) -> Array:
     """Return the least-squares coefficients, shape (k,); columns are scaled to unit mean square.
 
     Parameters
@@ -160,7 +159,7 @@ def regress(columns: Sequence[Vector], measured: Vector, *, what: str, stage: st
     return np.asarray(solution / scale)
 
 
-def jackknife_variance(estimate: Callable[[Sequence[Push]], Vector], pushes: Sequence[Push]) -> Vector:
+def jackknife_variance(estimate: Callable[[Sequence[Push]], Array], pushes: Sequence[Push]) -> Array:
     """Return the variance of an estimate over pushes left out one by one, shape (k,).
 
     What is wrong with a push (friction, heating) is the same in all its samples, so that the samples' own scatter

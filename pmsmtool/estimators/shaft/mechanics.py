@@ -18,8 +18,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.angle_harmonics import LEAST_SPEED, AngleHarmonics, angle_harmonics
 from pmsmtool.estimators.estimate import (
@@ -39,7 +39,6 @@ from pmsmtool.estimators.shaft.position import encoder_step, position_noise, pos
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
-Array = NDArray[np.float64]
 Torque = Callable[[Array, Array], Array]
 """Torque (N m) of arrays of i_d, i_q (A)."""
 

@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.shaft.disturbances import NONE, Disturbances
 from pmsmtool.estimators.shaft.motion import positions
-
-Array = NDArray[np.float64]
 
 SHAFT = 3
 """Parameters of the shaft without drag: ln J, B, tau_c."""

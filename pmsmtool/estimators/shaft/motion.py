@@ -6,9 +6,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pmsmtool.arrays import Array
 
 SERIES_BELOW = 1e-3
 """B T/J of an interval below which the way is a series; its next term is 1e-15."""

@@ -18,15 +18,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array
 from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.estimate import MEDIAN_TO_STD
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
 
 STAGE = "mechanics"
 ENCODER_STEPS_LEAST = 200
@@ -110,8 +108,6 @@ FLOOR_RAD = math.radians(0.2)
 """Least 95 % half width of the systematic part: what repeats every turn, cogging and the encoder's errors."""
 METHOD = "slow rotation, electrical turns of both directions"
 
-Vector = NDArray[np.float64]
-
 
 def offset_by_turns(found: EncoderResult, forward: Trace, backward: Trace) -> Estimate:
     """Return the offset with an interval from its spread over electrical turns (rad electrical).
@@ -144,7 +140,7 @@ def offset_by_turns(found: EncoderResult, forward: Trace, backward: Trace) -> Es
     )
 
 
-def _by_turn(found: EncoderResult, trace: Trace) -> Vector:
+def _by_turn(found: EncoderResult, trace: Trace) -> Array:
     """Return the mean deviation from the found offset in every whole electrical turn of a run."""
     imposed = np.asarray(trace["theta_imposed_rad"], dtype=np.float64)
     ahead = found.direction * round(found.pole_pairs.value) * np.asarray(trace["theta_M_rad"], dtype=np.float64)

@@ -11,13 +11,10 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pmsmtool.arrays import Array, Complex
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.trace import Trace
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 STAGE = "frequency response"
 LOWEST_HZ = 5.0
