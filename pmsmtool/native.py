@@ -56,8 +56,8 @@ def load(name: str) -> ctypes.CDLL:
         raise PmsmtoolError(
             f"the compiled kernel {name} is missing",
             where=str(path),
-            likely="the C sources were never built in this checkout, or the installation is damaged",
-            hint="in a checkout: python -m pmsmtool.packaging.build_kernels; otherwise install pmsmtool again",
+            likely="Python was started in the folder of the sources, which hides the installed pmsmtool",
+            hint="start Python in another folder; or build it here: python -m pmsmtool.packaging.build_kernels",
         )
     try:
         return ctypes.CDLL(str(path))

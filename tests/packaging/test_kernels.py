@@ -129,6 +129,8 @@ def test_missing_or_damaged_kernel_says_what_to_do(monkeypatch: pytest.MonkeyPat
     with pytest.raises(PmsmtoolError, match="build_kernels") as missing:
         native.load("pmsm_absent")
     assert str(tmp_path) in missing.value.where
+    # after `pip install .`, Python in the clone's folder imports the sources, which have no kernels
+    assert "hides the installed" in missing.value.likely and "another folder" in missing.value.hint
     (tmp_path / native.library_name("pmsm_damaged")).write_bytes(b"not a library")
     with pytest.raises(PmsmtoolError, match="another machine"):
         native.load("pmsm_damaged")
