@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,10 @@ WINDOW = 0.01
 RESTING = 1e-4
 """Largest change of the demand between samples at which it rests, of the way."""
 LEAST_SAMPLES = 50
+SAME_WAY = 0.01
+"""Ways of two moves that are the same (relative)."""
+SAME_SPEED = 0.1
+"""Mean speeds of their demands that are the same (relative): samples over a bus are some milliseconds apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +60,12 @@ UNITS = {
     "way_rad": "rad", "error_peak_rad": "rad", "error_rms_rad": "rad", "settling_s": "s", "error_end_rad": "rad",
     "current_peak_a": "A", "current_rms_a": "A", "moving_s": "s", "samples": "1",
 }  # fmt: skip
+
+
+def shown(value: float, unit: str) -> str:
+    """Return a number of a move as people read it."""
+    factor, told = {"rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms"), "1": (1.0, "")}.get(unit, (1.0, unit))
+    return f"{factor * value:.4g} {told}".strip()
 
 
 def move_result(trace: Trace) -> MoveResult:
@@ -125,3 +136,15 @@ def compared_moves(first: MoveResult, second: MoveResult) -> list[MoveDifference
         MoveDifference(name, unit, float(getattr(first, name)), float(getattr(second, name)))
         for name, unit in UNITS.items()
     ]
+
+
+def same_move(first: Trace, second: Trace) -> bool:
+    """Whether two records are of moves by one way at one speed, however often they went."""
+    (way, speed), (other_way, other_speed) = (_demanded(trace) for trace in (first, second))
+    return abs(other_way - way) <= SAME_WAY * way and abs(other_speed - speed) <= SAME_SPEED * speed
+
+
+def _demanded(trace: Trace) -> tuple[float, float]:
+    """Return the way (rad) and the mean speed (rad/s) of the demand while it moves."""
+    found = move_result(trace)
+    return found.way_rad, float(np.abs(np.diff(trace["theta_ref_rad"])).sum()) / found.moving_s

@@ -75,8 +75,6 @@ def diff_command(first: Path, second: Path, check: bool, plot_path: Path | None,
 
 
 MOVE = "move"
-SAME_WAY = 0.01
-"""Ways of two moves that are the same (relative)."""
 WORSE = 1.02
 """Following error, over the first one's, from which the second move is worse: whole counts of the encoder differ."""
 
@@ -89,8 +87,8 @@ def _moved(first: Path, second: Path) -> bool:
 
 
 def _diff_of_moves(first: Path, second: Path, check: bool, out: Output) -> None:
-    from pmsmtool.axis.move import compared_moves, move_result
-    from pmsmtool.cli.move import TRACE, shown
+    from pmsmtool.axis.move import SAME_WAY, compared_moves, move_result, shown
+    from pmsmtool.cli.move import TRACE
     from pmsmtool.errors import CheckFailed, ConfigError
     from pmsmtool.trace_file import read_trace
 

@@ -40,7 +40,6 @@ ERROR_SHARE = 0.5
 """Following error at which the voltage is removed, of the way."""
 DURATION_S = 45.0
 TRACE = "traces/move.npz"
-SHOWN = {"rad": (math.degrees, "deg"), "s": (lambda value: 1e3 * value, "ms")}
 
 
 @click.command(
@@ -243,14 +242,8 @@ def _held(drive: PositionDrive, name: str) -> float | None:
     return drive.read(name) if name in drive.node.map.cells else None
 
 
-def shown(value: float, unit: str) -> str:
-    """Return a number of a move as people read it."""
-    change, text = SHOWN.get(unit, (lambda same: same, "" if unit == "1" else unit))
-    return f"{change(value):.4g} {text}".strip()
-
-
 def _lines(found: MoveResult) -> list[str]:
-    from pmsmtool.axis.move import UNITS
+    from pmsmtool.axis.move import UNITS, shown
 
     rows = [(name, shown(float(getattr(found, name)), unit)) for name, unit in UNITS.items()]
     return table(("move", "value"), rows)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.axis.move import compared_moves, move_result, same_move, shown
 from pmsmtool.commissioning.recomputed_page import loop_margins, recomputed
 from pmsmtool.design.design_file import Design, load_design
 from pmsmtool.design.loops.current_loop import HOLD_PERIODS
@@ -27,6 +28,7 @@ from pmsmtool.design.prediction import Prediction
 from pmsmtool.errors import DesignInfeasible, IdentificationError
 from pmsmtool.files import read_text
 from pmsmtool.identification.by_injection import evaluation_of
+from pmsmtool.identification.compared_runs import same_drive
 from pmsmtool.identification.evaluate import Evaluation, evaluate, shots_of
 from pmsmtool.identification.fingerprint import STAGE as FINGERPRINT
 from pmsmtool.identification.request import REQUEST, parse_request
@@ -37,10 +39,11 @@ from pmsmtool.npz_file import read_npz
 from pmsmtool.proof.judgement import judge, with_ripple
 from pmsmtool.proof.stage import read_proof, responses
 from pmsmtool.report import figures
-from pmsmtool.report.report import Change, Figure, render
+from pmsmtool.report.report import Change, Figure, Table, render
 from pmsmtool.report.verdict import COMPLETE, Verdict, is_simulated, verdict_of
 from pmsmtool.run_directory import RunDirectory, RunRecord
 from pmsmtool.trace import Trace
+from pmsmtool.trace_file import read_trace
 
 NOT_CHECKED = (
     "Behaviour: the drive's bytes were compared, its step responses were not.",
@@ -56,7 +59,8 @@ SERVED = ("socketcand", "virtual", "udp_multicast")
 ANY_DRIVE = (
     "Whether a real drive answered: the bus is {}, and only a simulated drive of this program names itself (0x1008)."
 )
-ONE_STAGE = ("identify", "track", "prove")
+MOVE, TRACE_OF_MOVE = "move", "traces/move.npz"
+ONE_STAGE = ("identify", "track", "prove", MOVE)
 """Commands whose run is one stage of the same name."""
 CHAINS = ("commission", "fleet")
 """Commands whose run is a full commissioning."""
@@ -74,12 +78,14 @@ def report_page(path: str | Path) -> str:
     run = RunDirectory(Path(path))
     record = run.read()
     design = load_design(run.path / "design.toml") if (run.path / "design.toml").is_file() else None
+    moves = _moves(run, record)
     drawn = [
         *_of_stage("identify", 1.0, _identification_figures(run, record)),
         *_of_stage("tune", 2.0, _design_figures(design)),
         *_of_stage("margins", 2.5, _margin_figures(record, design)),
         *_of_stage("lut", 3.0, _table_figures(run.path / "lut.npz")),
         *_proof_figures(run, record, design),
+        *_of_stage(MOVE, 4.0, _move_figures(moves)),
     ]
     not_checked = NOT_CHECKED[1:] if record.passed("prove") else NOT_CHECKED
     if not any(record.passed(stage) for stage in ("flash", "verify", "prove")):
@@ -88,7 +94,8 @@ def report_page(path: str | Path) -> str:
         not_checked = (ANY_DRIVE.format(record.bus["interface"]), *not_checked)
     again = recomputed(design) if design is not None and "current_q" in design.loops else None
     return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=not_checked,
-                  complete=_complete(record), ended=account_lines(record.account), recomputed=again)  # fmt: skip
+                  complete=_complete(record), ended=account_lines(record.account), recomputed=again,
+                  moves=_move_table(moves))  # fmt: skip
 
 
 def verdict(path: Path) -> Verdict:
@@ -286,6 +293,45 @@ def _least_times(
     except DesignInfeasible:
         return None
     return np.array([0.0, *times]), {"i_d_a": np.array([0.0, *i_d[rows]]), "i_q_a": np.array([0.0, *i_q[rows]])}
+
+
+def _moves(run: RunDirectory, record: RunRecord) -> dict[str, Trace]:
+    """Return the run's move, after the same move of the same drive in the latest run before it, where there is one."""
+    if record.stage(MOVE) is None:
+        return {}
+    last = read_trace(run.path / TRACE_OF_MOVE)
+    earlier = (path for path in sorted(run.path.parent.iterdir(), reverse=True) if path.name < run.path.name)
+    for path in earlier:
+        if not (path / TRACE_OF_MOVE).is_file() or not same_drive(RunDirectory(path).read().drive, record.drive):
+            continue
+        before = read_trace(path / TRACE_OF_MOVE)
+        if same_move(before, last):
+            return {f"before: {path.name}": before, f"this run: {run.path.name}": last}
+    return {f"this run: {run.path.name}": last}
+
+
+def _move_table(moves: Mapping[str, Trace]) -> Table | None:
+    """Return the numbers of the moves as the report shows them."""
+    found = [move_result(trace) for trace in moves.values()]
+    if not found:
+        return None
+    rows = compared_moves(found[0], found[-1])
+    both = len(found) > 1
+    cells = [
+        (
+            row.name, *((shown(row.first, row.unit),) if both else ()), shown(row.second, row.unit),
+            *((f"{row.ratio:.3g}" if row.first else "-",) if both else ()),
+        )
+        for row in rows
+    ]  # fmt: skip
+    heads = ("move", *moves, "now / before") if both else ("move", *moves)
+    return heads, [[(text, "") for text in row] for row in cells]
+
+
+def _move_figures(moves: Mapping[str, Trace]) -> Iterator[Figure]:
+    if moves:
+        again = "of the same move before and in this run" if len(moves) > 1 else "of the move"
+        yield figures.move_figure(moves, f"Following error {again}.")
 
 
 def _changes(record: RunRecord) -> Sequence[Change]:

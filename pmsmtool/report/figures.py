@@ -413,6 +413,24 @@ def proof_figure(
     return _finished(canvas, caption)
 
 
+def move_figure(moves: Mapping[str, Trace], caption: str) -> Figure:
+    """Draw the following error of moves over the time since their demand began.
+
+    Parameters
+    ----------
+    moves : mapping of str to Trace
+        Recorded moves (``theta_ref_rad``, ``theta_m_rad``) by their names.
+    """
+    canvas, (axes,) = _canvas(1, 1, height=0.7)
+    for (name, trace), colour in zip(moves.items(), _colours(len(moves)), strict=True):
+        demand = trace["theta_ref_rad"]
+        t_s = trace.t_s - trace.t_s[int(np.argmax(demand != demand[0]))]
+        axes.plot(1e3 * t_s, np.degrees(demand - trace["theta_m_rad"]), color=colour, label=name)
+    axes.set(xlabel="time / ms", ylabel="following error / deg")
+    axes.legend(loc="best")
+    return _finished(canvas, caption)
+
+
 def _finished(canvas: Canvas, caption: str) -> Figure:
     return Figure(svg(canvas), caption, canvas=canvas)
 

@@ -60,6 +60,7 @@ def render(
     complete: Sequence[str] = COMPLETE,
     ended: Sequence[str] = (),
     recomputed: Mapping[str, Any] | None = None,
+    moves: Table | None = None,
 ) -> str:
     """Return the report as HTML.
 
@@ -79,6 +80,8 @@ def render(
         How a run ended that did not come to its end.
     recomputed : mapping, optional
         Of ``recompute.html.j2``: the step that the page computes again.
+    moves : tuple, optional
+        Heads and rows of the numbers of a move, beside those of the same move before.
     """
     latest = latest_of(record.get("stages", ()))
     drive = record.get("drive", {})
@@ -97,6 +100,7 @@ def render(
         recomputed=recomputed,
         first=None if first is None else drawn(first),
         stages=[_stage(stage, [figure for figure in left if figure.stage == stage["name"]]) for stage in latest],
+        moves=moves,
         comparison=_comparison(rows) if rows else None,
         figures=[drawn(figure) for figure in left if figure.stage not in shown],
         changes=_changes(changes) if changes else None,

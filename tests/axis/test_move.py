@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pmsmtool.axis.move import compared_moves, move_result
+from pmsmtool.axis.move import compared_moves, move_result, same_move
 from pmsmtool.axis.reference import Profile, plan
 from pmsmtool.errors import IdentificationError
 from pmsmtool.trace import Trace
@@ -14,10 +14,10 @@ from pmsmtool.trace import Trace
 WAY = 1.5
 
 
-def record(late_s: float, rest_a: float = 0.3) -> Trace:
+def record(late_s: float, rest_a: float = 0.3, *, way: float = WAY, speed: float = 8.0) -> Trace:
     """A shaft that follows its demand late by a fixed time, there and back, at 1 kHz; 2 A per 100 rad/s2."""
     t = np.arange(0.0, 2.0, 1e-3)
-    move = plan(WAY, Profile(8.0, 120.0))
+    move = plan(way, Profile(speed, 120.0))
 
     def path(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         there, _, up = move.at(at - 0.2)
@@ -26,7 +26,7 @@ def record(late_s: float, rest_a: float = 0.3) -> Trace:
 
     (demand, acceleration), (angle, _) = path(t), path(t - late_s)
     signals = {"theta_ref_rad": demand, "theta_m_rad": angle, "i_q_a": rest_a + 0.02 * acceleration}
-    return Trace(t, signals, {"theta_ref_rad": "rad", "theta_m_rad": "rad", "i_q_a": "A"}, {"way_rad": WAY})
+    return Trace(t, signals, {"theta_ref_rad": "rad", "theta_m_rad": "rad", "i_q_a": "A"}, {"way_rad": way})
 
 
 def test_a_shaft_that_follows_late_has_the_error_of_its_speed() -> None:
@@ -41,6 +41,12 @@ def test_settling_is_the_last_time_outside_one_percent_of_the_way() -> None:
     """At the end of a braking ramp the late shaft is 60 t^2 rad short: outside 15 mrad until 16 ms before it rests."""
     found = move_result(record(40e-3))
     assert found.settling_s == pytest.approx(40e-3 - np.sqrt(0.015 / 60.0), abs=3e-3)
+
+
+def test_the_same_move_has_the_same_way_and_speed() -> None:
+    assert same_move(record(40e-3), record(2e-3))
+    assert not same_move(record(2e-3), record(2e-3, way=1.03 * WAY))
+    assert not same_move(record(2e-3), record(2e-3, speed=6.0))
 
 
 def test_two_moves_number_by_number() -> None:

@@ -51,6 +51,13 @@ def test_the_same_move_with_stored_and_with_new_gains(tool: Tool, drive: Sequenc
     rows = {row["name"]: row for row in json.loads(printed)["moves"]}
     assert code == 0 and rows["error_peak_rad"]["ratio"] < MOST
     assert tool("diff", after["run"], before["run"], "--check")[0] == 1  # the other way round it got worse
+    assert tool("report", after["run"])[0] == 0
+    page = (Path(after["run"]) / "report.html").read_text(encoding="utf-8")
+    assert "now / before" in page and Path(before["run"]).name in page
+    assert "the same move before and in this run" in page
+    assert f">{rows['error_peak_rad']['ratio']:.3g}<" in page
+    assert tool("report", before["run"])[0] == 0  # there is no move before it
+    assert "now / before" not in (Path(before["run"]) / "report.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.chain
