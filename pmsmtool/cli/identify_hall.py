@@ -71,16 +71,16 @@ def identify_hall(bus: BusOptions, motion: MotionOptions, out: Output, runs: Pat
     run.save(TRACE, trace_npz(trace))
     found = hall_alignment(trace)
     wiring = found.wiring or "the wires are right"
+    axes = {f"hall.axis_{wire}_rad": axis for wire, axis in enumerate(found.axes_rad, 1)}
+    named = {"hall_offset_rad": found.offset_rad, "hall_lag_rad": found.lag_rad, **axes}
+    values = [{"name": name, "value": value, "unit": "rad"} for name, value in named.items()]
     summary = f"Hall sensors {found.order}, {math.degrees(found.offset_rad):.3g} deg; {wiring}"
-    values = [
-        {"name": name, "value": value, "unit": "rad"}
-        for name, value in (("hall_offset_rad", found.offset_rad), ("hall_lag_rad", found.lag_rad))
-    ]
     run.add(Stage("identify hall", "pass", seconds, values=values, files={TRACE: ""}, summary=summary))
-    data = {"run": run.path, **asdict(found), "wiring": found.wiring, "sectors": found.sectors()}
+    data = {"run": run.path, **asdict(found), "wiring": found.wiring, "sectors": found.sectors(), **axes}
     out.result("identify.hall", data, lambda: _lines(found))
     if found.wiring:
         out.warn(found.wiring)
+    out.note("by them: pmsmtool param set hall.commutation=2 " + " ".join(f"{k}={axes[k]:.4f}" for k in axes))
     out.note(f"run: {run.path}")
 
 

@@ -178,7 +178,9 @@ def _look(
     )  # fmt: skip
     found += [judge_supply(rest_v, turn, stated.inverter.U_dc_v), *judge_turn(turn, pole_pairs, against)]
     if halls and found[-1].verdict != NOT_SEEN:
-        found.append(judge_halls(turn))
+        used = drive.read("hall.commutation") > 0.5
+        axes = [drive.read(f"hall.axis_{wire}_rad") for wire in (1, 2, 3)] if used else []
+        found.append(judge_halls(turn, axes))
 
 
 def _counts(drive: CanopenDrive, stated: MachineFile) -> Finding:

@@ -270,8 +270,6 @@ def sag_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict[str
 
 
 def _encoder(source: MachineFile) -> dict[str, DesignValue]:
-    encoder = source.encoder
-    return {
-        "encoder.offset_rad": DesignValue(math.remainder(encoder.offset_rad, 2.0 * math.pi), GIVEN),
-        "encoder.reversed": DesignValue(float(encoder.direction < 0), GIVEN),
-    }
+    encoder, offset = source.encoder, math.remainder(source.encoder.offset_rad, 2.0 * math.pi)
+    given = {"encoder.offset_rad": offset, "encoder.reversed": float(encoder.direction < 0), **encoder.halls}
+    return {name: DesignValue(value, GIVEN) for name, value in given.items()}

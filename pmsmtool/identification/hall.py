@@ -72,11 +72,15 @@ class HallAlignment:
             return f"Hall wires {wrong[0] + 1} and {wrong[1] + 1} are swapped"
         return f"Hall wires 1, 2, 3 carry the sensors of phases {', '.join(self.order)}" if wrong else ""
 
+    @property
+    def axes_rad(self) -> tuple[float, ...]:
+        """Middle of the high half of wires 1, 2, 3: what ``hall.axis_1_rad`` and so on hold."""
+        by_phase = dict(zip(PHASES, self.errors_rad, strict=True))
+        return tuple(math.remainder(self.offset_rad + hall_axis(x) + by_phase[x], 2.0 * math.pi) for x in self.order)
+
     def sectors(self) -> dict[int, float]:
         """Return the middle of the angle in which the wires show each pattern, as they are wired (rad)."""
-        axes = [
-            self.offset_rad + hall_axis(phase) + self.errors_rad[PHASES.index(phase)] for phase in self.order
-        ]  # fmt: skip
+        axes = self.axes_rad
         quarter, turn = 0.5 * math.pi, 2.0 * math.pi
         edges = sorted(math.remainder(axis + side, turn) for axis in axes for side in (-quarter, quarter))
         middles = [0.5 * (low + high) for low, high in itertools.pairwise([*edges, edges[0] + turn])]

@@ -44,6 +44,7 @@ LEAST_SAMPLES = 8
 """Of a torque pulse whose bend is looked at."""
 NOT_LED = "the vector does not lead the rotor"
 HALLS_BY = "Hall wires of the connector; two motor leads swapped, if the encoder's sign is wrong, too"
+HALLS_SET = "the wires, or hall.axis_1_rad and so on: `pmsmtool identify hall` finds them"
 HELD_BY = "brake shut, or the shaft is held; an encoder that does not count; friction above this torque"
 SLIPS_BY = "friction, cogging or a load beyond this torque; a brake that is half open"
 SIGN_BY = "two motor leads swapped, or the encoder's tracks"
@@ -135,13 +136,16 @@ def _pole_pairs(ratio: float, stated: int, same: float) -> Finding:
     return Finding("pole pairs", WRONG, seen, f"{pairs}; or {counts}")
 
 
-def judge_halls(turn: Trace) -> Finding:
+def judge_halls(turn: Trace, axes_rad: Sequence[float] = ()) -> Finding:
     """Judge the Hall wires by the sectors that a led rotor passes.
 
     Parameters
     ----------
     turn : Trace
         As of :func:`judge_turn`, with ``hall_pattern``: bit k is wire k + 1.
+    axes_rad : sequence of float, optional
+        What a drive that commutates by them holds, ``hall.axis_1_rad`` and so on; default: the wires are to have the
+        order of the phases.
     """
     name, pattern, led = "Hall wires", turn["hall_pattern"], turn["at_rest"] < 0.5
     if np.ptp(pattern) == 0.0:
@@ -155,6 +159,11 @@ def judge_halls(turn: Trace) -> Finding:
         found = hall_alignment(Trace(turn.t_s[led], signals, dict.fromkeys(signals, "1"), {}))
     except IdentificationError as error:
         return Finding(name, WRONG, error.what, "a wire that is open, or sensors 60 deg apart; " + HALLS_BY)
+    if axes_rad:
+        pairs = zip(found.axes_rad, axes_rad, strict=True)
+        off = max(abs(math.remainder(there - held, 2.0 * math.pi)) for there, held in pairs)
+        seen = f"up to {math.degrees(off):.2g} deg (electrical) from hall.axis_1_rad and so on"
+        return Finding(name, WRONG, seen, HALLS_SET) if off > LAG_RAD else Finding(name, OK, seen)
     if found.wiring:
         return Finding(name, WRONG, found.wiring, HALLS_BY)
     return Finding(name, OK, f"in the order of the phases, {math.degrees(found.offset_rad):+.2g} deg off (electrical)")

@@ -83,6 +83,19 @@ ENCODER_KEYS: tuple[Key, ...] = (
     _key("encoder", "offset_rad", "rad", -_PI2, _PI2, 0.0, "theta_e = direction p theta_M - offset"),
     _key("encoder", "direction", "1", -1, 1, 1, "+1 along the phase order, -1 against it", kind="int"),
     _key("encoder", "bits", "1", 1, 32, None, "resolution per mechanical turn", kind="int"),
+    _key("encoder", "hall_commutation", "1", 0, 3, None, "by Hall sensors: 1 start, 2 alone, 3 six steps", kind="int"),
+    *(
+        _key(
+            "encoder",
+            f"hall_axis_{k}_rad",
+            "rad",
+            -_PI2,
+            _PI2,
+            None,
+            f"middle of Hall wire {k}'s high half, electrical",
+        )
+        for k in (1, 2, 3)
+    ),
 )
 
 LIMIT_KEYS: tuple[Key, ...] = (

@@ -161,6 +161,19 @@ class EncoderParameters:
     offset_rad: float = 0.0
     direction: int = 1
     bits: int | None = None
+    hall_commutation: int | None = None
+    hall_axis_1_rad: float | None = None
+    hall_axis_2_rad: float | None = None
+    hall_axis_3_rad: float | None = None
+
+    @property
+    def halls(self) -> dict[str, float]:
+        """Parameters of the Hall sensors (``hall.commutation`` and so on) that are stated."""
+        stated = {name: getattr(self, f"hall_{name}") for name in HALLS}
+        return {f"hall.{name}": float(value) for name, value in stated.items() if value is not None}
+
+
+HALLS = ("commutation", "axis_1_rad", "axis_2_rad", "axis_3_rad")
 
 
 @dataclass(frozen=True, slots=True)

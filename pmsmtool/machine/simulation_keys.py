@@ -85,6 +85,7 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number("encoder_twice_rad", "rad", -0.1, 0.1, 0.0, "encoder error twice per turn, amplitude (mechanical)"),
     _number("encoder_noise_rad", "rad", 0.0, 0.01, 0.0, "encoder noise, white, standard deviation (mechanical)"),
     _number("encoder_latency_s", "s", 0, 1e-3, 0.0, "age of an encoder sample"),
+    _choice("encoder_kind", ("absolute", "index", "none"), "absolute", "index: counts from it once it was passed"),
     _choice("hall_order", ("none", *HALL_ORDERS), "none", "Hall sensors: phase of the sensor on wires 1, 2, 3"),
     _number("hall_offset_rad", "rad", -_PI2, _PI2, 0.0, "electrical angle by which all sensors are turned"),
     _number("hall_error_a_rad", "rad", -1, 1, 0.0, "placement error of the sensor of phase a, electrical"),

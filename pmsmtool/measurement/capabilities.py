@@ -27,7 +27,7 @@ from pmsmtool.drive.motion_objects import (
     undecided,
     watched_by_tool,
 )
-from pmsmtool.drive.objects import SUPPORTED_MODES
+from pmsmtool.drive.objects import SUPPORTED_MODES, DriveObject
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.recorders.choice import described
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
@@ -64,6 +64,8 @@ FEATURES: Mapping[str, str] = {
     "torque mode": "torque mode (0x6502 bit 3 or 9)",
     "push": "torque mode (0x6502 bit 3 or 9), or a velocity mode whose unit a map states, with a current limit",
     "position": "position in increments of a known number per turn (0x6064 with 0x608F, or in a map of its maker)",
+    "encoder": "an encoder: between two edges of Hall sensors (hall.commutation) the angle is not measured",
+    "frame": "a frame that turns with the rotor: not six steps (hall.commutation 3; 2 for this time)",
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
     "vendor R": "the maker's identification of it, with its result, in a map that names this drive",
     "vendor L": "the maker's identification of it, with its result, in a map that names this drive",
@@ -80,6 +82,9 @@ _INJECT = (*_SAFE, "set-points", "excitation", "recorder")
 _RECORD = (*_SAFE, "recorder", "torque mode")
 _BOUNDED = ("supervision", "rated current")
 """What is safe where every command is a current that this program bounds: it replaces limits that the drive lacks."""
+_TURNING = (*_INJECT, "frame")
+_ANGLE = (*_TURNING, "encoder")
+"""What every sample of the angle is needed for."""
 _STANDARD = (*_BOUNDED, "position", "commutation angle")
 _PUSH = (*_BOUNDED, "push", "position", "current")
 _WATCHED = (*_SAFE, "position", "current")
@@ -285,6 +290,9 @@ class Capabilities:
         return str(method or (best.method if best else ""))
 
 
+HALL_COMMUTATION = DriveObject(0x2014, 1, "B")
+STARTS_ONLY, SIX_STEPS = 1, 3
+"""By Hall sensors until the encoder has its index; beyond that there is no encoder."""
 UNDECIDED = "no source says whether its amperes are peak or rms: +-17 % more"
 MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD, Method.VENDOR)
 """Methods that measure, the best first."""
@@ -333,9 +341,11 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     }
     rated = None if drive_map.staging else _told(lambda: rated_apk(node))
     if not drive_map.staging:
-        has |= _motion(node, rated)
+        has |= _motion(node, rated) | {"encoder": True, "frame": True}
         has["supervision"] = has["heartbeat"] or (node.has(0x100C, 0) and node.has(0x100D, 0)) or expects_pdos(node)
     else:  # only then these objects are what the reference drive has there
+        there = node.has(HALL_COMMUTATION.index, HALL_COMMUTATION.sub)
+        halls = node.whole(HALL_COMMUTATION) if there else 0
         torque = bool(modes & (_bit(Mode.PROFILE_TORQUE) | _bit(Mode.CYCLIC_TORQUE))) and node.has(0x6071, 0)
         has |= {
             "position": node.has(0x6064, 0) and node.has(0x608F, 1),
@@ -348,6 +358,8 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
             "excitation": node.has(0x2050, 0x0E),
             "averages": node.has(0x2063, 3),
             "recorder": node.has(0x2060, 8),
+            "encoder": halls <= STARTS_ONLY,
+            "frame": halls < SIX_STEPS,
         }
     named = identity.vendor != UNKNOWN_VENDOR and drive_map.is_for(*identity.vendor_product)
     found = {name for name, there in has.items() if there}
@@ -406,7 +418,8 @@ def _modes(node: DriveNode) -> int:
 
 def reference_capabilities(identity: Identity) -> Capabilities:
     """Return what the reference drive with everything gives."""
-    every = frozenset(_SAFE) | frozenset(_INJECT) | frozenset(_RECORD) | frozenset(_PUSH) | {"averages", "line voltage"}
+    every = frozenset(_SAFE) | frozenset(_INJECT) | frozenset(_RECORD) | frozenset(_PUSH)
+    every |= {"averages", "line voltage", "encoder", "frame"}
     return Capabilities(identity, reference_map(), True, every)
 
 
@@ -461,11 +474,12 @@ WAYS: Mapping[str, Mapping[Method, Way]] = {
     },
     "psi": {
         Method.INJECT: Way(
-            _INJECT, _expected(_FULL, 400, ("psi_f_wb", 1.1, "%")),
+            _TURNING, _expected(_FULL, 400, ("psi_f_wb", 1.1, "%")),
             from_records=_expected(_INJECT_RUN, 200, ("psi_f_wb", 1.2, "%")),
         ),
         Method.RECORDER: Way(
-            _RECORD, _expected(_RECORDER_RUN, 200, ("psi_f_wb", 1.2, "%")), "the drive must commutate already"
+            (*_RECORD, "frame"), _expected(_RECORDER_RUN, 200, ("psi_f_wb", 1.2, "%")),
+            "the drive must commutate already",
         ),
         Method.STANDARD: Way(
             (*_PUSH, "line voltage"),
@@ -478,11 +492,11 @@ WAYS: Mapping[str, Mapping[Method, Way]] = {
         Method.VENDOR: _vendor("psi"),
         Method.MANUAL: Way(),
     },
-    "map": {Method.INJECT: Way(_INJECT)},
+    "map": {Method.INJECT: Way(_ANGLE)},
     "inverter": {Method.INJECT: Way(_INJECT)},
     "encoder": {
         Method.INJECT: Way(
-            _INJECT, _expected(_FULL, 400, ("offset_rad", 0.04, "deg")),
+            _TURNING, _expected(_FULL, 400, ("offset_rad", 0.04, "deg")),
             from_records=_expected(_INJECT_RUN, 200, ("offset_rad", 0.05, "deg")),
         ),
         Method.STANDARD: Way(_STANDARD, _expected(_STANDARD_RUN, 200, ("offset_rad", 0.4, "deg"))),
@@ -495,23 +509,23 @@ WAYS: Mapping[str, Mapping[Method, Way]] = {
     },
     "mechanics": {
         Method.INJECT: Way(
-            _INJECT, _expected(_MECHANICS, 70, ("J_kgm2", 1.5, "%")),
+            _ANGLE, _expected(_MECHANICS, 70, ("J_kgm2", 1.5, "%")),
             from_records=_expected(_INJECT_RUN, 200, ("J_kgm2", 1.5, "%")),
         ),
         Method.RECORDER: Way(
-            (*_RECORD, "position"),
+            (*_RECORD, "position", "encoder"),
             _expected(_RECORDER_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")),
             "J/psi and tau_c/psi",
         ),
         Method.STANDARD: Way(
-            _PUSH, _expected(_STANDARD_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")),
+            (*_PUSH, "encoder"), _expected(_STANDARD_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 30.0, "%")),
             "J/psi and tau_c/psi; over the torque constant where the pole pairs are not known",
         ),
         Method.MANUAL: Way(),
     },
-    "frf": {Method.INJECT: Way(_INJECT)},
-    "cogging": {Method.INJECT: Way(_INJECT)},
-    "harmonics": {Method.INJECT: Way(_INJECT)},
+    "frf": {Method.INJECT: Way(_ANGLE)},
+    "cogging": {Method.INJECT: Way(_ANGLE)},
+    "harmonics": {Method.INJECT: Way(_ANGLE)},
 }  # fmt: skip
 """Methods of each quantity: what the drive must have, what to expect, what limits it."""
 QUANTITIES = tuple(WAYS)

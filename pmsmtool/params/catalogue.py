@@ -204,6 +204,22 @@ _ROWS: tuple[tuple[str, int, int, WireType, str, float, float, float, bool, str]
         False,
         "natural frequency of the speed estimate",
     ),
+    # 0x2014 Hall sensors
+    (
+        "hall.commutation",
+        0x2014,
+        0x01,
+        _U8,
+        "1",
+        0,
+        0,
+        3,
+        False,
+        "by Hall sensors: 0 not, 1 start, 2 alone, 3 six steps",
+    ),
+    ("hall.axis_1_rad", 0x2014, 0x02, _F32, "rad", 0, -6.2831855, 6.2831855, False, "middle of wire 1's high half"),
+    ("hall.axis_2_rad", 0x2014, 0x03, _F32, "rad", 2.0943951, -6.2831855, 6.2831855, False, "of wire 2's, electrical"),
+    ("hall.axis_3_rad", 0x2014, 0x04, _F32, "rad", 4.1887902, -6.2831855, 6.2831855, False, "of wire 3's, electrical"),
     # 0x2020 current controller
     ("current.K_p_d_v_per_a", 0x2020, 0x01, _F32, "V/A", 6.9, 0, 1e5, True, "proportional gain, d axis"),
     ("current.K_i_d_v_per_as", 0x2020, 0x02, _F32, "V/(A s)", 411, 0, 1e8, True, "integral gain, d axis"),

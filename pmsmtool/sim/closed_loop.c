@@ -180,6 +180,26 @@ static void read_encoder(double theta_M, pmsm_sensors *sensors)
     sensors->angle = (uint32_t)counted;
 }
 
+static int64_t whole_turns(double theta_M)
+{
+    const double turns = theta_M * (1.0 / PMSM_REAL64_TWO_PI);
+    return (int64_t)turns - (turns < (double)(int64_t)turns ? 1 : 0);
+}
+
+/* Zero of the count of an encoder that has not passed its index yet. */
+static double unreferenced(pmsm_sim *sim, double theta_M, pmsm_sensors *sensors)
+{
+    sensors->encoder_unreferenced = 0;
+    if (sim->setup.sensors.encoder != PMSM_SENSOR_INDEX || sim->encoder_indexed)
+        return 0.0;
+    if (!sim->encoder_on)
+        sim->encoder_zero = theta_M;
+    sim->encoder_on = 1;
+    sim->encoder_indexed = whole_turns(theta_M) != whole_turns(sim->encoder_zero);
+    sensors->encoder_unreferenced = sim->encoder_indexed ? 0u : 1u;
+    return sim->encoder_indexed ? 0.0 : sim->encoder_zero;
+}
+
 static void sample(pmsm_sim *sim, const pmsm_output *acting, double T_s, double theta_M, pmsm_sensors *sensors)
 {
     const pmsm_sensor_setup *setup = &sim->setup.sensors;
@@ -201,7 +221,8 @@ static void sample(pmsm_sim *sim, const pmsm_output *acting, double T_s, double 
     sensors->U_dc = (float)(setup->U_dc_gain * sim->U_dc);
     sensors->T_winding = (float)(setup->T_lag > 0.0 ? sim->T_winding_shown : sim->plant.T_winding);
     sensors->T_magnet = (float)sim->plant.T_magnet;
-    read_encoder(theta_M, sensors);
+    read_encoder(theta_M - unreferenced(sim, theta_M, sensors), sensors);
+    sensors->encoder_failed |= (setup->encoder == PMSM_SENSOR_NO_ENCODER) ? 1u : 0u;
     sensors->limits = 0;
     if (sim->has_switches) {
         const double shaft = sim->plant.state.theta_M + (double)sim->plant.state.turns * PMSM_REAL64_TWO_PI;

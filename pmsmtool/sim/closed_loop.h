@@ -101,6 +101,8 @@ typedef struct pmsm_sim {
     double T_winding_shown;    /* degC, of the lagging sensor */
     double encoder_held;       /* rad, reading of a stuck encoder */
     uint32_t encoder_is_held;
+    double encoder_zero;       /* rad, where an encoder with an index was switched on */
+    uint32_t encoder_on, encoder_indexed;
     uint64_t period, t_ns;
     /* record */
     double *record;

@@ -29,7 +29,14 @@ typedef struct {
     double drift;                /* A/s, offset of phase a; that of b drifts against it */
     double hall_axis[3];         /* rad electrical: middle of the half turn in which a Hall wire is high */
     uint32_t hall;               /* 1: there are Hall sensors */
+    uint32_t encoder;            /* enum pmsm_sensor_encoder */
 } pmsm_sensor_setup;
+
+enum pmsm_sensor_encoder {
+    PMSM_SENSOR_ABSOLUTE = 0,
+    PMSM_SENSOR_INDEX,           /* counts from where it was switched on until its first index */
+    PMSM_SENSOR_NO_ENCODER
+};
 
 enum pmsm_sensor_fault {
     PMSM_SENSOR_OK = 0,

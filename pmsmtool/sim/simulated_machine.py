@@ -26,6 +26,8 @@ SHAPES = ("none", "sign", "atan", "tanh", "capacitive")
 """``deadtime_shape`` in the order of ``enum pmsm_deadtime_shape``."""
 MODELS = ("averaged", "switched")
 """``inverter_model`` in the order of ``enum pmsm_inverter_model``."""
+ENCODERS = ("absolute", "index", "none")
+"""``encoder_kind`` in the order of ``enum pmsm_sensor_encoder``."""
 ROTORS = {"free": Rotor.FREE, "locked": Rotor.LOCKED, "driven": Rotor.DRIVEN}
 
 DRIVE_FAULTS = {
@@ -286,6 +288,7 @@ def _sensors(out: Any, machine_file: MachineFile, settings: Settings, violations
     out.encoder_noise = settings.number("encoder_noise_rad")
     out.encoder_once, out.encoder_twice = settings.number("encoder_once_rad"), settings.number("encoder_twice_rad")
     out.cubic, out.drift = settings.number("sensor_cubic"), settings.number("sensor_drift_apk_per_s")
+    out.encoder = ENCODERS.index(settings.text("encoder_kind"))
     order = settings.text("hall_order")
     out.hall = int(order != "none")
     if out.hall:

@@ -31,3 +31,26 @@ def test_swapped_wires_are_named(tool: Tool, tmp_path: Path) -> None:
     assert found["order"] == "bac" and "Hall wires 1 and 2 are swapped" in said
     assert math.degrees(abs(found["offset_rad"] - 0.25)) < 2.0  # measured 0.2
     assert "voltage off, drive restored" in said and (Path(found["run"]) / "traces" / "hall.npz").is_file()
+
+
+@pytest.mark.chain
+def test_a_drive_without_encoder_commutates_by_what_was_found(tool: Tool, tmp_path: Path) -> None:
+    """Any axes let a current vector turn the rotor; with those that are found the drive turns with it."""
+    base = drive(tmp_path, encoder_kind="none", hall_order="bca", hall_offset_rad=0.2, hall_error_a_rad=0.15)
+    sim = ("--sim", base.replace(":memory:", str(tmp_path / "drive.nv")), "--yes")
+    code, printed, _ = tool("check", *sim, "--json")
+    assert code != 0 and "0x7305" in printed, "without commutation there is no angle"
+    assert tool("param", "set", "--store", "hall.commutation=2", *sim)[0] == 0
+    code, printed, said = tool("identify", "hall", *sim, "--json")
+    assert code == 0, said
+    found = json.loads(printed)
+    command = next(line for line in said.splitlines() if "pmsmtool param set" in line)
+    assert tool("param", "set", "--store", *command.split("param set ")[1].split(), *sim)[0] == 0
+    truth = [0.2 + 2.0 * math.pi / 3.0 * k + (0.15 if k == 0 else 0.0) for k in (1, 2, 0)]
+    for axis, true in zip((found[f"hall.axis_{k}_rad"] for k in (1, 2, 3)), truth, strict=True):
+        assert math.degrees(abs(math.remainder(axis - true, 2.0 * math.pi))) < 3.0  # measured 1.1
+    code, printed, _ = tool("check", *sim, "--json")
+    rows = {row["looked_at"]: row for row in json.loads(printed)["findings"]}
+    assert rows["Hall wires"]["verdict"] == "ok" and "from hall.axis_1_rad" in rows["Hall wires"]["shown"]
+    code, printed, said = tool("identify", "mechanics", *sim)
+    assert code == 9 and "needs an encoder" in said

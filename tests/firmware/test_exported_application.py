@@ -7,7 +7,6 @@ import ctypes
 import math
 import shutil
 import subprocess
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,7 +27,9 @@ VALUES = {row.name: row.default for row in CATALOGUE} | TUNED | {"position.inert
 PERIODS = 3000
 
 
-def exported(folder: Path) -> ctypes.CDLL:
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
+    folder = tmp_path_factory.mktemp("exported")
     for name, text in c_files(pack_image(VALUES)).items():
         (folder / name).write_text(text)
     sources = sorted(path.name for path in folder.glob("*.c"))
@@ -40,9 +41,9 @@ def exported(folder: Path) -> ctypes.CDLL:
 class Running:
     """One application, and what it computed last."""
 
-    def __init__(self, library: Any) -> None:
+    def __init__(self, library: Any, halls: int) -> None:
         self.library = library
-        self.params = core().params(VALUES)
+        self.params = core().params(VALUES | {"hall.commutation": halls})
         self.app = TYPES["pmsm_application"]()
         self.trace, self.output = (ctypes.c_uint8 * 4096)(), TYPES["pmsm_output"]()
         library.pmsm_application_init(ctypes.byref(self.app), ctypes.byref(self.params), None)
@@ -85,9 +86,14 @@ def ask(app: Any, k: int) -> None:
         app.quick_stop = 1
 
 
+def hall_wires(theta_e: float) -> int:
+    return sum((math.cos(theta_e - k * 2 * math.pi / 3) >= 0.0) << k for k in range(3))
+
+
 @pytest.mark.skipif(COMPILER is None, reason="no C compiler on this machine")
-def test_the_compiled_export_equals_the_simulated_drives_application(tmp_path: Path) -> None:
-    mine, theirs = Running(load("pmsm_sim")), Running(exported(tmp_path))
+@pytest.mark.parametrize("halls", [0, 1, 2, 3])
+def test_the_compiled_export_equals_the_simulated_drives_application(exported: ctypes.CDLL, halls: int) -> None:
+    mine, theirs = Running(load("pmsm_sim"), halls), Running(exported, halls)
     rng = np.random.default_rng(4)
     seen: set[int] = set()
     phases: set[int] = set()
@@ -97,6 +103,7 @@ def test_the_compiled_export_equals_the_simulated_drives_application(tmp_path: P
         i = rng.normal(0.0, 3.0, 3)
         sensors = TYPES["pmsm_sensors"](i[0], i[1], i[2], 210.0, 30.0, 30.0, parts >> 32, parts & 0xFFFFFFFF)
         sensors.limits = int(620 < k < 700 or 1230 < k < 1260)
+        sensors.hall, sensors.encoder_unreferenced = hall_wires(VALUES["motor.pole_pairs"] * theta), int(k < 400)
         sensors.U_dc = 210.0 if k < 2900 else 900.0
         for one in (mine, theirs):
             ask(one.app, k)

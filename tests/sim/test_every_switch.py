@@ -143,11 +143,11 @@ SWITCHES: dict[str, tuple[Value, Mapping[str, Value]]] = {
 }
 """Key: another value, and what must be on for it to matter."""
 
-HALL = {"hall_order", "hall_offset_rad", *(f"hall_error_{phase}_rad" for phase in "abc")}
+HALL = {"encoder_kind", "hall_order", "hall_offset_rad", *(f"hall_error_{phase}_rad" for phase in "abc")}
 LIMITS = {"limit_switch_negative_rad", "limit_switch_positive_rad"}
 ELSEWHERE = {"serial", *HALL, *LIMITS}
 """Keys that no trace of `simulate` shows: serial number and limit switches are objects of the node (tests/node), and so
-are the Hall wires (tests/cli/test_identify_hall)."""
+are the Hall wires (tests/cli/test_identify_hall). The kind of encoder is tried in tests/firmware/test_hall."""
 
 SCENARIO = Scenario(
     "switches",

@@ -16,12 +16,14 @@ void pmsm_application_init(pmsm_application *app, const pmsm_params *params, con
     app->recorder.decimation = 1u;
     app->average.command = PMSM_COMMAND_TAKEN;
     pmsm_speed_prepare(&app->speed, params);
+    pmsm_hall_prepare(&app->hall, params);
 }
 
 void pmsm_application_parameters_changed(pmsm_application *app)
 {
     pmsm_parameters_changed(&app->control);
     pmsm_speed_prepare(&app->speed, app->params);
+    pmsm_hall_prepare(&app->hall, app->params);
 }
 
 void pmsm_application_reset_fault(pmsm_application *app)
@@ -53,7 +55,8 @@ void pmsm_application_period(pmsm_application *app, const pmsm_sensors *sensors,
     pmsm_reference reference = app->reference;
     float angle = app->fixed_angle;
     app->sensors = *sensors;
-    pmsm_speed_update(&app->speed, sensors);
+    pmsm_hall_update(app);
+    pmsm_speed_update(app);
     app->recording.trip_last = app->trip;
     if (app->trip == (uint32_t)PMSM_TRIP_NONE) {
         app->trip = pmsm_find_trip(app);
@@ -73,7 +76,8 @@ void pmsm_application_period(pmsm_application *app, const pmsm_sensors *sensors,
     measure(app, angle, &measurement);
     pmsm_step(&app->control, app->params, app->lut, &measurement, &reference, output);
     if (app->trip == (uint32_t)PMSM_TRIP_NONE && app->control.fault != (uint32_t)PMSM_FAULT_NONE) {
-        app->trip = (uint32_t)PMSM_TRIP_INTERNAL;
+        const uint32_t seen = (pmsm_is_nan(measurement.theta_e) != 0u) ? 0u : 1u;
+        app->trip = (seen != 0u) ? (uint32_t)PMSM_TRIP_INTERNAL : (uint32_t)PMSM_TRIP_ENCODER;
     }
     app->control.live.flags |= (sensors->adc_clipped != 0u) ? (uint32_t)PMSM_FLAG_ADC_CLIPPED : 0u;
     app->control.live.flags |= (app->wave.active != 0u) ? (uint32_t)PMSM_FLAG_EXCITATION : 0u;

@@ -28,9 +28,17 @@ static inline uint32_t pmsm_nearest_turn(const pmsm_sensors *sensors)
 
 /* speed_estimate.c */
 void pmsm_speed_prepare(pmsm_speed_estimate *speed, const pmsm_params *params);
-void pmsm_speed_update(pmsm_speed_estimate *speed, const pmsm_sensors *sensors);
-/* Electrical angle of the rotor by the encoder (rad, within one turn); NaN when it failed. */
+void pmsm_speed_update(pmsm_application *app);
+/* Electrical angle of the rotor (rad, within one turn); NaN when the sensor failed. */
 float pmsm_rotor_angle(const pmsm_application *app);
+/* An angle of at most a turn as 2^-32 turns. */
+uint32_t pmsm_turn_part(float angle_rad);
+
+/* hall.c: the rotor by the Hall wires, before anything reads the sensors; alone they take the encoder's place there */
+void pmsm_hall_prepare(pmsm_hall *hall, const pmsm_params *params);
+void pmsm_hall_update(pmsm_application *app);
+/* Electrical speed of the last sector, rad per period; less where the next edge is overdue, 0 after a reversal. */
+float pmsm_hall_speed(const pmsm_hall *hall);
 
 /* trajectory.c: where the reference of a move is; all quantities per step of the speed controller */
 typedef struct {

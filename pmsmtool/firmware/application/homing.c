@@ -60,6 +60,7 @@ static void start(const pmsm_application *app, pmsm_position *p, uint32_t count)
     const int32_t method = p->asked.homing.method;
     p->homing_turns = app->sensors.turns;
     p->pushed = 0.0F;
+    p->indexed = 0u;
     if (method == (int32_t)PMSM_HOMING_HERE) {
         found(p, count);
     } else if ((by_switch(method) | by_index(method) | by_stop(method)) != 0u) {
@@ -70,13 +71,20 @@ static void start(const pmsm_application *app, pmsm_position *p, uint32_t count)
     }
 }
 
-/* Whichever way the index was passed, it is where the higher of the two turns begins. */
+/* Whichever way the index was passed, it is where the higher of the two turns begins. The first one is where the
+ * encoder's count has its zero from then on. */
 static void look_for_index(const pmsm_application *app, pmsm_position *p)
 {
     const uint32_t turns = (uint32_t)app->sensors.turns;
     const uint32_t before = (uint32_t)p->homing_turns;
-    if (turns != before) {
+    if (app->sensors.encoder_unreferenced != 0u) {
+        p->indexed = 0u;
+    } else if (p->indexed != 0u) {
+        found(p, p->asked.increments * pmsm_nearest_turn(&app->sensors));
+    } else if (turns != before) {
         found(p, p->asked.increments * ((turns - before < 0x80000000u) ? turns : before));
+    } else {
+        /* on the way */
     }
 }
 

@@ -1,6 +1,7 @@
 /* SPDX-License-Identifier: MIT */
-/* The application around the control core, at PWM rate: speed estimate, position control, trips, quick stop,
- * excitation, recorder, window averages. The simulated drive runs these files; for another drive they are optional.
+/* The application around the control core, at PWM rate: speed estimate, Hall sensors, position control, homing, trips,
+ * quick stop, excitation, recorder, window averages. The simulated drive runs these files; for another drive they are
+ * optional.
  *
  * binary32 and integers, no allocation, no C library. Whoever asks (a bus, a user interface) reads and writes the
  * members between two periods.
@@ -43,7 +44,8 @@ typedef struct {                 /* what the sensors deliver at the sampling ins
     uint32_t encoder_failed;     /* 1: turns and angle are no reading */
     uint32_t limits;             /* limit switches that are active: bit 0 negative, bit 1 positive direction */
     uint32_t adc_clipped;        /* 1: a sample stood at full scale */
-    uint32_t hall;               /* levels of the Hall wires, bit k of wire k; nothing but the recorder reads them */
+    uint32_t hall;               /* levels of the Hall wires, bit k of wire k + 1 */
+    uint32_t encoder_unreferenced; /* 1: turns and angle count from anywhere, 0: from the encoder's index */
 } pmsm_sensors;
 
 enum pmsm_shape {                /* object 0x2050:01 */
@@ -89,19 +91,43 @@ typedef struct {                 /* object 0x2063: means over a window, taken in
 enum pmsm_trip {
     PMSM_TRIP_NONE = 0, PMSM_TRIP_OVERCURRENT = 0x2310, PMSM_TRIP_OVERVOLTAGE = 0x3210,
     PMSM_TRIP_UNDERVOLTAGE = 0x3220, PMSM_TRIP_OVERTEMPERATURE = 0x4310, PMSM_TRIP_OVERSPEED = 0x8480,
-    PMSM_TRIP_INTERNAL = 0x5530
+    PMSM_TRIP_INTERNAL = 0x5530,
+    PMSM_TRIP_ENCODER = 0x7305   /* no angle of the rotor, by encoder or Hall sensors */
 };
 
 typedef struct {                 /* speed estimate */
     float omega;                 /* rad/s, mechanical, along the phase order */
     float lag;                   /* rad, by which the estimated angle is behind the encoder */
     float keep, beta;            /* gains, from the active parameters: share of an error that stays; 1/s */
+    float lost;                  /* share of a first-order error that a period takes away */
     float T_s;                   /* s */
     uint32_t angle;              /* last reading */
     uint32_t follows;            /* 0: the next reading starts the estimate's angle, without a jump */
+    uint32_t unreferenced;       /* of the last reading */
     uint32_t reversed;           /* direction that lag and omega were estimated with */
     uint32_t offset;             /* electrical angle of the encoder's zero, 2^-32 turns */
 } pmsm_speed_estimate;
+
+enum pmsm_hall_commutation {     /* parameter hall.commutation */
+    PMSM_HALL_NONE = 0,
+    PMSM_HALL_START,             /* until the encoder counts from its index */
+    PMSM_HALL_ALONE,             /* in place of an encoder: angle, speed and position */
+    PMSM_HALL_STEPS              /* the same, and the frame stands in the middle of the sector: six steps per turn */
+};
+
+typedef struct {                 /* rotor by the Hall sensors; electrical angles, 2^-32 turns */
+    uint32_t angle;
+    uint32_t failed;             /* 1: the wires show no sector */
+    /* private memory */
+    uint32_t axis[3];            /* where wires 1 to 3 are in the middle of their high half, from the parameters */
+    uint32_t low, width;         /* sector: where it begins, how wide it is; width 0: none was seen */
+    uint32_t edge;               /* that was passed last, or the middle of the first sector */
+    uint32_t entered, up;        /* 1: over an edge, upwards */
+    uint32_t since;              /* periods in the sector */
+    float expected;              /* periods it is expected to take, 0: not known */
+    uint32_t encoder;            /* electrical angle of the encoder at the edge */
+    uint32_t counted, period, turns; /* last angle, electrical and mechanical turns that were counted */
+} pmsm_hall;
 
 typedef struct {                 /* memory of a running excitation */
     uint64_t phase, step, curvature; /* 2^-64 turns: angle of the sine, its increment, the increment's increment */
@@ -225,6 +251,8 @@ typedef struct {
     uint32_t homing_started;     /* start as it was at the last step */
     int32_t homing_turns;        /* turns of the encoder at the last step */
     float pushed;                /* s, with the torque of a stop */
+    uint32_t unreferenced;       /* of the last reading */
+    uint32_t indexed;            /* 1: the encoder has got its reference since the homing began */
 } pmsm_position;
 
 typedef struct pmsm_application {
@@ -248,6 +276,7 @@ typedef struct pmsm_application {
     float applied_angle;                /* rad, fixed frame angle of the last period, NaN when it followed the rotor */
     /* private memory */
     pmsm_speed_estimate speed;
+    pmsm_hall hall;
     pmsm_wave wave;
     pmsm_recorder_memory recording;
     pmsm_average_memory averaging;

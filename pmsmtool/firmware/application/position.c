@@ -20,6 +20,19 @@ static int32_t position_of(const pmsm_sensors *sensors, const pmsm_position_requ
     return (int32_t)((uint32_t)sensors->turns * asked->increments + (uint32_t)within + (uint32_t)asked->offset);
 }
 
+/* A position goes on where the encoder's count gets another zero, from its index. */
+static void read_position(pmsm_position *p, const pmsm_sensors *sensors)
+{
+    const int32_t before = p->actual;
+    p->actual = position_of(sensors, &p->asked);
+    if (p->unreferenced != sensors->encoder_unreferenced) {
+        p->asked.offset = (int32_t)((uint32_t)p->asked.offset + (uint32_t)before - (uint32_t)p->actual);
+        p->actual = before;
+        p->unreferenced = sensors->encoder_unreferenced;
+        p->indexed = 1u;
+    }
+}
+
 /* What is asked for, per step of T seconds. The acceleration asks for no more steps of jerk than there is memory. */
 static pmsm_profile profile_of(const pmsm_position_request *asked, float T, float deceleration)
 {
@@ -173,7 +186,9 @@ void pmsm_control_position(pmsm_application *app, pmsm_reference *reference)
 {
     pmsm_position *p = &app->position;
     const float T = app->speed.T_s * (float)app->params->speed_decimation;
-    p->actual = (app->sensors.encoder_failed != 0u) ? p->actual : position_of(&app->sensors, &p->asked);
+    if (app->sensors.encoder_failed == 0u) {
+        read_position(p, &app->sensors);
+    }
     p->limits = app->sensors.limits;
     if (app->enabled == 0u || app->trip != (uint32_t)PMSM_TRIP_NONE || app->quick_stop != 0u ||
         reference->mode != (uint32_t)PMSM_MODE_POSITION) {

@@ -2,13 +2,12 @@
 /* Mechanical speed from the encoder's angle: critically damped, both poles at exp(-w T). */
 #include "application_parts.h"
 
-/* The encoder's zero as 2^-32 electrical turns; the parameter is at most a turn. */
-static uint32_t offset_of(float offset_rad)
+uint32_t pmsm_turn_part(float angle_rad)
 {
-    const float turns = pmsm_abs(offset_rad) / (2.0F * PMSM_PI);
+    const float turns = pmsm_abs(angle_rad) / (2.0F * PMSM_PI);
     const float part = (turns >= 1.0F) ? turns - 1.0F : turns;
     const uint32_t size = (uint32_t)(part * 4294967296.0F);
-    return (offset_rad < 0.0F) ? 0u - size : size;
+    return (angle_rad < 0.0F) ? 0u - size : size;
 }
 
 /* exp(-w T) by a series that stays positive. */
@@ -19,8 +18,9 @@ void pmsm_speed_prepare(pmsm_speed_estimate *speed, const pmsm_params *params)
     const float growth = x * (1.0F + x * (0.5F + x / 6.0F));
     const float lost = growth / (1.0F + growth);
     speed->keep = 1.0F / ((1.0F + growth) * (1.0F + growth));
+    speed->lost = lost;
     speed->beta = lost * lost / speed->T_s;
-    speed->offset = offset_of(params->encoder_offset_rad);
+    speed->offset = pmsm_turn_part(params->encoder_offset_rad);
     if (params->encoder_reversed != speed->reversed) { /* the same rotation, counted the other way */
         speed->omega = -speed->omega;
         speed->lag = -speed->lag;
@@ -30,14 +30,22 @@ void pmsm_speed_prepare(pmsm_speed_estimate *speed, const pmsm_params *params)
 
 /* Only differences of readings enter, so no digits are lost over many turns. The step's own slope enters through the
  * predicted angle: a constant speed leaves no error. */
-void pmsm_speed_update(pmsm_speed_estimate *speed, const pmsm_sensors *sensors)
+void pmsm_speed_update(pmsm_application *app)
 {
+    pmsm_speed_estimate *speed = &app->speed;
+    const pmsm_sensors *sensors = &app->sensors;
     if (sensors->encoder_failed != 0u) {
         speed->follows = 0u; /* trips; the speed estimate must survive it, the rotor turns on unseen */
         return;
     }
-    if (speed->follows == 0u) {
+    if (app->params->hall_commutation >= (uint32_t)PMSM_HALL_ALONE) { /* by its edges: the angle between has steps */
+        const float along = pmsm_hall_speed(&app->hall) / ((float)app->params->motor_pole_pairs * speed->T_s);
+        speed->omega += speed->lost * (((speed->reversed != 0u) ? -along : along) - speed->omega);
+        return;
+    }
+    if (speed->follows == 0u || speed->unreferenced != sensors->encoder_unreferenced) { /* another zero is no motion */
         speed->follows = 1u;
+        speed->unreferenced = sensors->encoder_unreferenced;
         speed->lag = 0.0F;
     } else {
         const float raw = pmsm_signed_angle(sensors->angle - speed->angle);
@@ -51,7 +59,13 @@ void pmsm_speed_update(pmsm_speed_estimate *speed, const pmsm_sensors *sensors)
 
 float pmsm_rotor_angle(const pmsm_application *app)
 {
+    const uint32_t kind = app->params->hall_commutation;
+    const pmsm_hall *hall = &app->hall;
+    if (kind == (uint32_t)PMSM_HALL_START && app->sensors.encoder_unreferenced != 0u) {
+        return (hall->failed != 0u) ? PMSM_NAN : pmsm_signed_angle(hall->angle);
+    }
     const uint32_t counted = app->params->motor_pole_pairs * app->sensors.angle;
-    const uint32_t along = (app->speed.reversed != 0u) ? 0u - counted : counted;
+    const uint32_t shown = (kind == (uint32_t)PMSM_HALL_STEPS) ? hall->low + hall->width / 2u : counted;
+    const uint32_t along = (app->speed.reversed != 0u) ? 0u - shown : shown;
     return (app->sensors.encoder_failed != 0u) ? PMSM_NAN : pmsm_signed_angle(along - app->speed.offset);
 }

@@ -10,8 +10,8 @@ extern "C" {
 #endif
 
 #define PMSM_PARAMS_SCHEMA_VERSION 1u
-#define PMSM_PARAMS_SIGNATURE 0x2077D183u /* CRC-32 of name:type:dim:unit:scale in struct order */
-#define PMSM_PARAMS_WORDS 93u
+#define PMSM_PARAMS_SIGNATURE 0x49E6AE16u /* CRC-32 of name:type:dim:unit:scale in struct order */
+#define PMSM_PARAMS_WORDS 97u
 #define PMSM_PARAMS_LUT_WORDS_MAX 8192u
 #define PMSM_K_MAX_NOT_DETERMINED 255u
 
@@ -53,6 +53,10 @@ typedef struct pmsm_params {
     float    encoder_offset_rad;             /* [rad] theta_e = direction p theta_M - offset */
     uint32_t encoder_reversed;               /* 1: the encoder counts against the phase order */
     float    encoder_pll_bandwidth_rad_s;    /* [rad/s] natural frequency of the speed estimate */
+    uint32_t hall_commutation;               /* by Hall sensors: 0 not, 1 start, 2 alone, 3 six steps */
+    float    hall_axis_1_rad;                /* [rad] middle of wire 1's high half */
+    float    hall_axis_2_rad;                /* [rad] of wire 2's, electrical */
+    float    hall_axis_3_rad;                /* [rad] of wire 3's, electrical */
     float    current_K_p_d_v_per_a;          /* [V/A] proportional gain, d axis */
     float    current_K_i_d_v_per_as;         /* [V/(A s)] integral gain, d axis */
     float    current_K_p_q_v_per_a;          /* [V/A] proportional gain, q axis */

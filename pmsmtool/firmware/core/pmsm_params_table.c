@@ -39,6 +39,10 @@ const pmsm_param_limit pmsm_param_limits[PMSM_PARAMS_WORDS] = {
     {-6.28318548F, 6.28318548F, 0u}, /* encoder.offset_rad */
     {0.0F, 1.0F, 1u}, /* encoder.reversed */
     {1.0F, 100000.0F, 0u}, /* encoder.pll_bandwidth_rad_s */
+    {0.0F, 3.0F, 1u}, /* hall.commutation */
+    {-6.28318548F, 6.28318548F, 0u}, /* hall.axis_1_rad */
+    {-6.28318548F, 6.28318548F, 0u}, /* hall.axis_2_rad */
+    {-6.28318548F, 6.28318548F, 0u}, /* hall.axis_3_rad */
     {0.0F, 100000.0F, 0u}, /* current.K_p_d_v_per_a */
     {0.0F, 100000000.0F, 0u}, /* current.K_i_d_v_per_as */
     {0.0F, 100000.0F, 0u}, /* current.K_p_q_v_per_a */
