@@ -13,7 +13,7 @@ from pmsmtool.axis.loops import AxisGains, AxisPath, best_share, following_error
 from pmsmtool.axis.reference import Profile, jerk_limited, plan
 from pmsmtool.axis.search import Box, Case, Judged, Limits, stiffest
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
-from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop
+from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, axis_loop
 from pmsmtool.design.loops.sampled_loop import SampledLoop
 from pmsmtool.design.loops.speed_loop import Notch
 from pmsmtool.design.ratings import ratings_of
@@ -364,10 +364,7 @@ def axis_path(
 def _current(design: Design) -> SampledLoop:
     machine, inverter = design.machine.machine, design.machine.inverter
     plant = AxisPlant(machine.R_s_ohm, machine.L_q_h, inverter.T_s, inverter.delay_periods)
-    gains = CurrentGains(
-        design["current.K_p_q_v_per_a"], design["current.K_i_q_v_per_as"],
-        float(design.facts["current_bandwidth_rad_s"]), Method.IMC,
-    )  # fmt: skip
+    gains = CurrentGains(design["current.K_p_q_v_per_a"], design["current.K_i_q_v_per_as"])
     return axis_loop(gains, plant, plant if design.request.get("predictor") else None)
 
 

@@ -66,11 +66,6 @@ class Examination:
     nodes: tuple[FoundNode, ...]
     findings: tuple[tuple[str, str], ...] = field(default=())
 
-    @property
-    def ok(self) -> bool:
-        """Whether a node answered and nothing failed."""
-        return all(verdict != "FAIL" for verdict, _ in self.findings)
-
 
 def adapters() -> list[Adapter]:
     """Return every interface python-can knows here, with whether its module loads."""

@@ -34,7 +34,6 @@ class LssCommand(IntEnum):
     SELECTED = 0x44
     FAST_SCAN_FOUND = 0x4F
     FAST_SCAN = 0x51
-    INQUIRE_NODE_ID = 0x5E
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,11 +103,6 @@ class LssMaster:
         for offset, number in enumerate(parts):
             self._send(LssCommand.SELECT_VENDOR + offset, number.to_bytes(4, "little"))
         self._await(LssCommand.SELECTED, TIMEOUT_S, "the selection")
-
-    def node_id(self) -> int:
-        """Return the node id of the selected slave, 255 when it has none."""
-        self._send(LssCommand.INQUIRE_NODE_ID)
-        return self._await(LssCommand.INQUIRE_NODE_ID, TIMEOUT_S, "the question for the node id")[1]
 
     def set_node_id(self, node: int) -> None:
         """Give the selected slave a node id (1..127; 255: none); it takes it when the configuration state is left.

@@ -416,23 +416,20 @@ def _allowed(ctx: click.Context, kwargs: dict[str, Any]) -> MotionOptions:
     )
 
 
-def motion_options(function: Function) -> Function:
-    """Add the envelope and ``--yes`` to a command that moves the machine; it receives ``motion: MotionOptions``."""
-
+def _allowing(function: Function, options: tuple[Option, ...]) -> Function:
     @functools.wraps(function)
     def command(*args: Any, **kwargs: Any) -> Any:
         motion = _allowed(click.get_current_context(), kwargs)
         return function(*args, motion=motion, **kwargs)
 
-    return _apply(command, (*_ENVELOPE_PARAMETERS, *_SURROUNDINGS_PARAMETERS, _yes_parameter(False)))
+    return _apply(command, options)
+
+
+def motion_options(function: Function) -> Function:
+    """Add the envelope and ``--yes`` to a command that moves the machine; it receives ``motion: MotionOptions``."""
+    return _allowing(function, (*_ENVELOPE_PARAMETERS, *_SURROUNDINGS_PARAMETERS, _yes_parameter(False)))
 
 
 def write_options(function: Function) -> Function:
     """Add ``--yes`` and what it needs to a command that writes the drive; it receives ``motion: MotionOptions``."""
-
-    @functools.wraps(function)
-    def command(*args: Any, **kwargs: Any) -> Any:
-        motion = _allowed(click.get_current_context(), kwargs)
-        return function(*args, motion=motion, **kwargs)
-
-    return _apply(command, (*_ENVELOPE_PARAMETERS, _yes_parameter(False)))
+    return _allowing(function, (*_ENVELOPE_PARAMETERS, _yes_parameter(False)))

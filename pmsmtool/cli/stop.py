@@ -29,8 +29,7 @@ def stop_command(bus: BusOptions, out: Output, everyone: bool) -> None:
     A drive that brakes has the time of its ramp; one without a valid answer for 2 s has not confirmed. Several drives
     are stopped at the same time. Nothing is waited for that another program does with the drive.
     """
-    from pmsmtool.drive.drive_node import DriveNode
-    from pmsmtool.drive.stop import state_text
+    from pmsmtool.drive.drive_node import DriveNode, state_text
 
     with bus.connect() as connection:
         nodes = [DriveNode(connection, node_id) for node_id in _whom(connection, bus.node, everyone)]

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode, State
 from pmsmtool.drive import objects, stop
-from pmsmtool.drive.drive_node import DriveNode, is_safe
+from pmsmtool.drive.drive_node import DriveNode, is_safe, state_text
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Excitation, Halves, Injection, ProfileMove, Recording, Shape
 from pmsmtool.drive.recorders.reference import Recorder
@@ -300,7 +300,7 @@ class CanopenDrive:
             raise self.node.fault_error()
         if state is not State.OPERATION_ENABLED:
             raise DriveFault(
-                f"the drive left operation during a measurement: it is in {stop.state_text(state)}",
+                f"the drive left operation during a measurement: it is in {state_text(state)}",
                 where=f"node {self.node.node}",
                 likely="it missed the tool's heartbeat because this computer was busy, or another program stopped it",
                 hint="run the command again; nothing of this measurement was used",

@@ -19,9 +19,8 @@ from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE, NmtCommand, NmtState, send
 from pmsmtool.cia402 import AbortConnection, FaultReaction, QuickStop, State
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.drive_node import DriveNode, is_safe
+from pmsmtool.drive.drive_node import DriveNode, is_safe, state_text
 from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat, expect_pdo
-from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import SafetyRefusal, SdoAbort
 
 CONSUMER_MS = 250

@@ -209,7 +209,7 @@ class DriveNode:
             if self.wait_for_state(lambda now: now is not before) is before:  # noqa: B023
                 break
         raise DriveFault(
-            f"the drive stays in {_state_name(state)} and does not enable",
+            f"the drive stays in {state_text(state)} and does not enable",
             where=f"node {self.node}, 0x6041:00",
             likely="no DC-link voltage, or a missing hardware enable or safe-torque-off input",
             hint="check the supply and the enable inputs",
@@ -398,5 +398,6 @@ def is_safe(state: State | None) -> bool:
     return state is not None and not state.energised
 
 
-def _state_name(state: State | None) -> str:
+def state_text(state: State | None) -> str:
+    """Return a state as people write it."""
     return "an undefined state" if state is None else state.name.replace("_", " ")

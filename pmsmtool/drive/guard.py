@@ -18,14 +18,13 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.changed_objects import ChangedObjects
 from pmsmtool.drive.dead_man import DeadManProof, prove_dead_man, set_quick_stop
-from pmsmtool.drive.drive_node import is_safe
+from pmsmtool.drive.drive_node import is_safe, state_text
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.motion_objects import OVER_SPEED_TRIP, lowered_trip, trips_itself
 from pmsmtool.drive.own_limits import NO_LIMITS, lower_limits, put_limit
 from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, ProfileMove, Recording, Shape
-from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import (
     BusError,
     DriveFault,

@@ -174,7 +174,7 @@ _SUFFIX_UNITS = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_a", "A
 
 
 def signal_unit(name: str) -> str:
-    """Return the unit of a live quantity from its suffix, ``1`` where it has none."""
+    """Return the unit of a signal from its suffix, ``1`` where it has none."""
     return next((unit for suffix, unit in _SUFFIX_UNITS if name.endswith(suffix)), "1")
 
 

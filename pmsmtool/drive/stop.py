@@ -11,7 +11,7 @@ from pmsmtool.bus.sdo import OutOfTime
 from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.cia402 import Command, QuickStop, State
 from pmsmtool.drive import objects
-from pmsmtool.drive.drive_node import STATE_TIMEOUT_S, DriveNode, is_safe
+from pmsmtool.drive.drive_node import STATE_TIMEOUT_S, DriveNode, is_safe, state_text
 from pmsmtool.drive_maps.drive_map import LETTERS
 from pmsmtool.errors import BusError, DriveFault, PmsmtoolError, SdoAbort, StopNotConfirmed
 
@@ -146,11 +146,6 @@ def nobody_confirms(why: str, likely: str) -> StopNotConfirmed:
     return StopNotConfirmed(
         f"no stop was confirmed ({why}): the machine may be energised", likely=likely, hint=_HARDWARE_STOP
     )
-
-
-def state_text(state: State | None) -> str:
-    """Return a state as people write it."""
-    return "an undefined state" if state is None else state.name.replace("_", " ")
 
 
 def _stop_once(node: DriveNode, say: Callable[[str], None], *, ramp: bool) -> State:

@@ -60,13 +60,10 @@ class PhaseCheck:
         Current along each vector (A).
     impedance_ohm : tuple of float
         u/i along each vector, dead-time voltage included (ohm).
-    spread : float
-        Largest relative difference of either.
     """
 
     currents_a: tuple[float, float, float]
     impedance_ohm: tuple[float, float, float]
-    spread: float
 
 
 def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
@@ -136,7 +133,6 @@ def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
     return PhaseCheck(
         (float(along[0]), float(along[1]), float(along[2])),
         (float(impedance[0]), float(impedance[1]), float(impedance[2])),
-        max(spread, across),
     )
 
 
@@ -148,18 +144,15 @@ class PairCheck:
     ----------
     resistance_ohm : tuple of float
         Slope of the voltage with phase a, b and c idle (ohm).
-    spread : float
-        Largest difference between them, relative.
     mismatch : SensorMismatch
         Gains of the current sensors over their mean.
     judged : bool
-        Whether the rotor was at rest, so that the spread means something.
+        Whether the rotor was at rest, so that their differences mean something.
     std_ohm : float
         Standard deviation of a difference between two slopes: noise, and legs that are not alike.
     """
 
     resistance_ohm: tuple[float, float, float]
-    spread: float
     mismatch: SensorMismatch
     judged: bool = True
     std_ohm: float = math.inf
@@ -229,7 +222,7 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
         i.reshape(3, 2), lost.reshape(3, 2), rest, strict=True
     )]  # fmt: skip
     std = math.hypot(sigma * float(np.max(np.abs(raw))), float(np.ptp(legs)) * float(np.max(np.abs(taken))))
-    return PairCheck(resistances, _spread(slopes), mismatch, not moved, std)
+    return PairCheck(resistances, mismatch, not moved, std)
 
 
 def over_phases(resistance: ResistanceResult, pairs: PairCheck, tolerance: SensorTolerance) -> ResistanceResult:

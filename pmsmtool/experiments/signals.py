@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from pmsmtool.drive.objects import signal_unit
 from pmsmtool.trace import Trace
 
 UNUSABLE_FLAGS = 1 << 0 | 1 << 1 | 1 << 9
 """Voltage limited, duty clipped, ADC at full scale (``enum pmsm_flag``)."""
-
-_SUFFIX_UNITS = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_a", "A"), ("_v", "V"), ("_c", "degC"))
 
 
 def readable(trace: Trace, **facts: Any) -> Trace:
@@ -23,17 +22,12 @@ def readable(trace: Trace, **facts: Any) -> Trace:
         signals["theta_M_rad"] = signals.pop("theta_m_rad")
     if "flags" in signals:
         signals["flagged"] = flagged(signals.pop("flags"))
-    return Trace(trace.t_s, signals, {name: unit_of(name) for name in signals}, {**trace.meta, **facts})
+    return Trace(trace.t_s, signals, {name: signal_unit(name) for name in signals}, {**trace.meta, **facts})
 
 
 def flagged(flags: Any) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Return 1 where a flag word names a limit, else 0."""
     return np.asarray((np.asarray(flags).astype(np.int64) & UNUSABLE_FLAGS) != 0, dtype=np.float64)
-
-
-def unit_of(name: str) -> str:
-    """Return the unit of a signal from its suffix, ``1`` where it has none."""
-    return next((unit for suffix, unit in _SUFFIX_UNITS if name.endswith(suffix)), "1")
 
 
 def table(rows: Sequence[Mapping[str, float]], times: Sequence[float], **facts: Any) -> Trace:
@@ -51,6 +45,6 @@ def table(rows: Sequence[Mapping[str, float]], times: Sequence[float], **facts: 
     return Trace(
         np.array([time - start for time in times], dtype=np.float64),
         {name: np.array([row[name] for row in rows], dtype=np.float64) for name in names},
-        {name: unit_of(name) for name in names},
+        {name: signal_unit(name) for name in names},
         dict(facts),
     )

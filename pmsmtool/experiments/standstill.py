@@ -79,10 +79,6 @@ class LevelPlan:
     drift: float = DRIFTED
     turn_s: float = TURN_S
 
-    def duration_s(self, period_s: float) -> float:
-        """Return the time the levels take without waiting for the rotor (s)."""
-        return len(self.levels_a) * (self.settle_s + 2 * self.half_window(period_s) * period_s)
-
     def half_window(self, period_s: float) -> int:
         """Return the control periods of half a window."""
         return round(max(1, round(0.5 * self.window_periods * period_s / RIPPLE_S)) * RIPPLE_S / period_s)

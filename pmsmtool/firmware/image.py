@@ -26,6 +26,7 @@ from pmsmtool.params.catalogue import (
     SATURATION_VALUES,
     Parameter,
 )
+from pmsmtool.params.parameter_set import to_binary32
 from pmsmtool.plain_text import counted
 
 LUT_FORMAT_NONE, LUT_FORMAT_BINARY32, LUT_FORMAT_INT16 = 0, 1, 2
@@ -65,14 +66,6 @@ class ImageRefused(ConfigError):
     ) -> None:
         super().__init__(what, where="parameter image", violations=violations, likely=likely, hint=hint)
         self.status = status
-
-
-def to_binary32(value: float) -> float:
-    """Return the nearest binary32 value, infinity when it is too large for one."""
-    try:
-        return float(struct.unpack("<f", struct.pack("<f", value))[0])
-    except OverflowError:
-        return math.copysign(math.inf, value)
 
 
 def _violation(row: Parameter, value: float) -> str | None:

@@ -11,9 +11,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pmsmtool.drive.drive_node import DriveNode, is_safe
+from pmsmtool.drive.drive_node import DriveNode, is_safe, state_text
 from pmsmtool.drive.port import Identity
-from pmsmtool.drive.stop import state_text
 from pmsmtool.errors import SafetyRefusal, VerifyMismatch
 from pmsmtool.flash.journal import Entry, JournalFolder, Snapshot, read_snapshot, write_snapshot
 from pmsmtool.resources import user_folder

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError, IdentificationError
+from pmsmtool.files import make_folder
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
@@ -78,14 +79,7 @@ def _may_write(run: RunDirectory, text: str) -> bool:
 
 def _beside(run: RunDirectory) -> RunDirectory:
     folder = run.path / REPLAYED
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be made: {error.strerror or error}",
-            where=str(folder),
-            hint="check your rights there and the space on the disk",
-        ) from error
+    make_folder(folder, hint="check your rights there and the space on the disk")
     return RunDirectory(folder)
 
 

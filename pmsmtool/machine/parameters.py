@@ -106,12 +106,6 @@ class MachineParameters:
         """Apparent q inductance where known, else the incremental one (H)."""
         return self.L_q_h if self.L_q_app_h is None else self.L_q_app_h
 
-    @property
-    def saliency(self) -> float:
-        """The larger apparent inductance over the smaller."""
-        pair = self.L_d_decoupling_h, self.L_q_decoupling_h
-        return max(pair) / min(pair)
-
     def torque_nm(self, i_d_a: float, i_q_a: float) -> float:
         """Torque of the linear machine (N m), 1.5 p (psi_d i_q - psi_q i_d)."""
         psi_d = self.psi_f_wb + self.L_d_decoupling_h * i_d_a

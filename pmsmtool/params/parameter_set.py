@@ -194,7 +194,8 @@ def _is_number(value: object) -> bool:
     return isinstance(value, float) or (type(value) is int and abs(value) < _INTEGER_LIMIT)
 
 
-def _binary32(value: float) -> float:
+def to_binary32(value: float) -> float:
+    """Return the nearest binary32 value, infinity when it is too large for one."""
     try:
         return float(struct.unpack("<f", struct.pack("<f", value))[0])
     except OverflowError:
@@ -206,7 +207,7 @@ def _bound_violations(name: str, value: float) -> list[str]:
     if not math.isfinite(value):
         return [f"{name} = {value!r} is not finite"]
     # The drive judges the binary32 value, so a bound that is not one must not refuse its own image.
-    low, x, high = (value_ if row.is_integer else _binary32(value_) for value_ in (row.minimum, value, row.maximum))
+    low, x, high = (value_ if row.is_integer else to_binary32(value_) for value_ in (row.minimum, value, row.maximum))
     found = []
     if not low <= x <= high:
         found.append(f"{name} = {value:.9g} {row.unit} is outside [{row.minimum:.9g}, {row.maximum:.9g}]")

@@ -36,7 +36,7 @@ from pmsmtool.errors import (
     SdoAbort,
     VerifyMismatch,
 )
-from pmsmtool.files import write_file
+from pmsmtool.files import make_folder, write_file
 from pmsmtool.flash.restore import plan_download
 from pmsmtool.machine.parameters import Brake, Load, Shaft
 from pmsmtool.npz_file import npz_bytes, read_npz
@@ -283,15 +283,9 @@ def commit(run: RunDirectory, prediction: Prediction) -> tuple[str, str]:
     names = chain((stem,), (f"{stem}-{k}" for k in count(2)))
     folder = next(name for name in names if not (run.path / name).exists())
     path = run.path / folder / PREDICTION
-    try:
-        path.parent.mkdir(parents=True)
-    except OSError as error:
-        raise ConfigError(
-            f"the prediction cannot be committed: {error.strerror}",
-            where=str(path),
-            hint="check your rights there and the space on the disk",
-        ) from error
-    write_file(path, data, synced=True, hint="check your rights there and the space on the disk")
+    hint = "the prediction is not committed: check your rights there and the space on the disk"
+    make_folder(path.parent, hint=hint)
+    write_file(path, data, synced=True, hint=hint)
     return digest, folder
 
 

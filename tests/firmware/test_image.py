@@ -24,11 +24,11 @@ from pmsmtool.firmware.image import (
     lut_size_words,
     pack_image,
     saturation_words,
-    to_binary32,
     unpack_image,
 )
 from pmsmtool.firmware.params_header import CORE_DIRECTORY, c_float, generated_files
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, SCHEMA_VERSION, Parameter, layout_signature
+from pmsmtool.params.parameter_set import to_binary32
 from pmsmtool.sim.node.parameter_set import ParameterImage
 
 DEFAULTS = {row.name: row.default for row in CATALOGUE}

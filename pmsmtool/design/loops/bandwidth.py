@@ -62,7 +62,7 @@ class CurrentChoice:
         plant = self.plants[axis]
         if self.request.method == Method.SECOND_ORDER:
             return second_order(plant.R, plant.L, self.alpha, self.request.damping)
-        return replace(imc(plant.R, plant.L, self.alpha), method=Method(self.request.method))
+        return imc(plant.R, plant.L, self.alpha)
 
     def loop(self, axis: str, plant: AxisPlant | None = None) -> SampledLoop:
         """Return the loop of an axis, on its design plant or another."""

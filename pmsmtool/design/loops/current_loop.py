@@ -51,16 +51,10 @@ class CurrentGains:
         Proportional gain (V/A).
     K_i : float
         Integral gain (V/(A s)).
-    alpha : float
-        Bandwidth the gains were designed for (rad/s); the natural frequency for ``SECOND_ORDER``.
-    method : Method
-        Rule that gave them.
     """
 
     K_p: float
     K_i: float
-    alpha: float
-    method: Method
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +84,7 @@ def modulus_optimum_bandwidth(T_s: float, delay_periods: float) -> float:
 
 def imc(R: float, L: float, alpha: float) -> CurrentGains:
     """Cancel the plant's pole: K_p = alpha L, K_i = alpha R, closed loop alpha / (s + alpha)."""
-    return CurrentGains(alpha * L, alpha * R, alpha, Method.IMC)
+    return CurrentGains(alpha * L, alpha * R)
 
 
 def second_order(R: float, L: float, omega_n: float, zeta: float) -> CurrentGains:
@@ -108,7 +102,7 @@ def second_order(R: float, L: float, omega_n: float, zeta: float) -> CurrentGain
             likely=f"the plant's own pole R/L = {R / L:.4g} rad/s is faster than 2 zeta w_n",
             hint=f"ask for w_n above {R / (2.0 * zeta * L):.4g} rad/s",
         )
-    return CurrentGains(K_p, omega_n**2 * L, omega_n, Method.SECOND_ORDER)
+    return CurrentGains(K_p, omega_n**2 * L)
 
 
 def axis_loop(gains: CurrentGains, plant: AxisPlant, model: AxisPlant | None = None) -> SampledLoop:

@@ -21,7 +21,7 @@ from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.headroom import Headroom, HeadroomLimits, OperatingCells, headroom, operating_cells
 from pmsmtool.design.loops.bandwidth import least_inductance
-from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop
+from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, axis_loop
 from pmsmtool.design.loops.open_loops import designed_speed_loop
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.vector_margins import (
@@ -237,12 +237,9 @@ def margin_problem(design: Design) -> MarginProblem:
         for axis, L in zip(_AXES, (machine.L_d_h, machine.L_q_h), strict=True)
     }
     gains = {
-        axis: CurrentGains(
-            design[f"current.K_p_{axis}_v_per_a"], design[f"current.K_i_{axis}_v_per_as"],
-            design["governor.alpha_rad_s"], Method.IMC,
-        )
+        axis: CurrentGains(design[f"current.K_p_{axis}_v_per_a"], design[f"current.K_i_{axis}_v_per_as"])
         for axis in _AXES
-    }  # fmt: skip
+    }
     predictor = bool(int(design["current.options"]) & _PREDICTOR_OPTION) and delay >= 1.0
     limits = HeadroomLimits(
         design["inverter.voltage_utilisation"], design["motor.I_max_apk"], design["protection.I_cont_apk"],

@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.loops.bandwidth import least_inductance
-from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, Method, axis_loop, maximum_delay_periods
+from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, axis_loop, maximum_delay_periods
 from pmsmtool.design.loops.sampled_loop import LoopMargins, SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, speed_loop
 from pmsmtool.machine.two_masses import shafts_of
@@ -137,10 +136,7 @@ def _plant(design: Design, axis: str) -> AxisPlant:
 
 
 def _gains(design: Design, axis: str) -> CurrentGains:
-    alpha = float(design.facts.get("current_bandwidth_rad_s", math.nan))
-    return CurrentGains(
-        design[f"current.K_p_{axis}_v_per_a"], design[f"current.K_i_{axis}_v_per_as"], alpha, Method.IMC
-    )
+    return CurrentGains(design[f"current.K_p_{axis}_v_per_a"], design[f"current.K_i_{axis}_v_per_as"])
 
 
 def _saturated(design: Design) -> dict[str, LoopMargins]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,9 +61,13 @@ class CommandedRecorder(Recorder):
             raise NotAvailable(f"the drive has no {self.what}", where=abort.where) from abort
 
     @property
-    @abstractmethod
     def signals(self) -> tuple[str, ...]:
         """Signals it can take."""
+        return tuple(self._known())
+
+    def _known(self) -> Mapping[str, Any]:
+        """Return the rows of the map by their signals: channels of the recorder."""
+        return self._node.map.recorder.channels
 
     @property
     def period_s(self) -> float:

@@ -26,11 +26,6 @@ class RowRecorder(CommandedRecorder):
     data = "0x2509:00"
     memory = "0x2504:00"
 
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """Signals it can take."""
-        return tuple(self._node.map.recorder.channels)
-
     def _base_period_s(self) -> float:
         reference_ns = self._get(objects.REFERENCE_PERIOD_NS)
         self._channels_there = min(self._get(objects.COUNT), objects.CHANNELS)

@@ -28,11 +28,6 @@ class RingRecorder(CommandedRecorder):
     data = "0x201B:00"
     memory = "0x2018:00"
 
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """Signals it can take."""
-        return tuple(self._node.map.recorder.channels)
-
     def _base_period_s(self) -> float:
         self._get(objects.STATUS)
         unit = self._node.map.recorder.period

@@ -26,11 +26,6 @@ class MonitorRecorder(CommandedRecorder):
     data = "0x58B2:00"
     memory = "0x58B5:00"
 
-    @property
-    def signals(self) -> tuple[str, ...]:
-        """Signals it can take."""
-        return tuple(self._known())
-
     def _base_period_s(self) -> float:
         rate_hz, self._largest = self._get(objects.LOOP_RATE_HZ), self._get(objects.LARGEST_BYTES)
         if rate_hz <= 0:

@@ -23,11 +23,10 @@ from pmsmtool.firmware.image import (
     ImageRefused,
     ImageStatus,
     crc32,
-    to_binary32,
     unpack_image,
 )
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, LUT_CAPACITY_WORDS, SATURATION_VALUES, Parameter
-from pmsmtool.params.parameter_set import SATURATION
+from pmsmtool.params.parameter_set import SATURATION, to_binary32
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 
 LUT_PARTS = ("lut.axis_x", "lut.axis_y", "lut.axis_z", "lut.table_i_d", "lut.table_i_q")
