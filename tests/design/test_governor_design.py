@@ -74,6 +74,17 @@ def test_at_rest_only_the_resistance_is_missed() -> None:
     assert euler_error(MODEL, 0.0, V_MAX, 28.0) < 2e-3
 
 
+@pytest.mark.parametrize(("L_d", "L_q"), [(1e-3, 4e-3), (4e-3, 1e-3)])
+def test_at_rest_each_axis_decays_by_its_own_inductance(L_d: float, L_q: float) -> None:
+    """The faster axis is off by more: what is left of i, and what u adds, by the exponential of R T/L."""
+    model = PredictionModel(2.0, L_d, L_q, PSI, T_S, imc(2.0, L_d, 4000.0), imc(2.0, L_q, 4000.0))
+    L, gains = (L_d, model.gains_d) if L_d < L_q else (L_q, model.gains_q)
+    x, I_a = 2.0 * T_S / L, 28.0
+    of_current, of_voltage = (math.exp(-x) - 1.0 + x) * I_a, (x - 1.0 + math.exp(-x)) / 2.0 * V_MAX
+    expected = (of_current + of_voltage) * gains.K_p / V_MAX
+    assert euler_error(model, 0.0, V_MAX, I_a) == pytest.approx(expected, rel=1e-6)
+
+
 @pytest.mark.chain
 def test_modes_and_options() -> None:
     source = load_machine_file(PROFILES / "jercic-2017.toml")

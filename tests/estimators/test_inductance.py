@@ -12,7 +12,7 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, Verdict
 from pmsmtool.estimators.injection.angle_dependence import UNSEEN_RANGE
 from pmsmtool.estimators.injection.axis_layout import Motion
-from pmsmtool.estimators.injection.inductance import EDGE_STD, FrameAhead, InductanceResult, estimate_inductances
+from pmsmtool.estimators.injection.inductance import EDGE_STD, FrameAhead, InductanceResult, _bias, estimate_inductances
 from pmsmtool.estimators.injection.output_error import AxisModel
 from pmsmtool.estimators.injection.sampling_instant import INSTANTS, LAGS, ShownInstant
 from pmsmtool.estimators.inverter_error import InverterCurve
@@ -197,6 +197,14 @@ def test_each_axis_is_unmixed_with_the_angle_of_its_own_shots(plain: Shots) -> N
     # the bias is stated in the rotor's own frame
     mean = float(np.mean([np.mean(trace["i_d_a"]) for trace in shots["q"]]))
     assert result.L_q.i_q_apk == pytest.approx(mean * math.sin(-0.2), rel=0.02)
+
+
+def test_the_bias_is_turned_into_the_rotors_frame() -> None:
+    """A current along the rotor's d axis, as a frame ahead of it by 0.3 rad shows it."""
+    shown = 4.0 * np.exp(-0.3j) * np.array([0.9, 1.1])
+    trace = Trace(np.arange(2.0), {"i_d_a": shown.real, "i_q_a": shown.imag}, {"i_d_a": "A", "i_q_a": "A"})
+    assert _bias([trace, trace], 0.3) == pytest.approx((4.0, 0.0), abs=1e-12)
+    assert _bias([trace], -0.3) == pytest.approx((4.0 * math.cos(0.6), -4.0 * math.sin(0.6)))
 
 
 def test_a_salient_machine_shows_its_axis_without_turning(plain: Shots) -> None:

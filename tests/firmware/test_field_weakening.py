@@ -198,6 +198,19 @@ def test_steady_current_of_table_1_is_the_optimum(mode: int, rpm: float, torque:
     assert pytest.approx(6 * (0.41 + 0.0002 * expected[0]) * expected[1], abs=BIAS_NM) == T
 
 
+def test_only_the_ratio_of_the_weights_counts() -> None:
+    """Both four times as large or small, which binary numbers bear exactly: the same steps, the same current."""
+    runs = []
+    for scale in (1.0, 4.0, 0.25):
+        values = governed(ACCELERATED)
+        for weight in ("field_weakening.h1", "field_weakening.h2"):
+            values[weight] *= scale
+        loop = Loop(core(), values, omega=800 * RPM, U_dc=V_DC)
+        live = [loop.step(mode=MODE_TORQUE, tau_ref=40.0 if k < 40 else -20.0) for k in range(80)]
+        runs.append([loop.plant.i.tolist(), live[-1].i_d_req, live[-1].i_q_req, live[-1].iterations])
+    assert runs[0] == runs[1] == runs[2]
+
+
 FIELD_WEAKENING_STEPS = 14
 """Newton steps of one period, an iteration counted as three: ``STEPS_MOST`` of ``field_weakening.c``."""
 

@@ -238,15 +238,14 @@ def _charged(model: AxisModel, share: Array, gone: float, period_s: float) -> ND
     """Current and sensor output at an interval's end per volt of two pulses, shape (2, n).
 
     The interval begins ``gone`` periods after the pulses' own period. What a pulse does depends smoothly on its width
-    as long as it lies inside the interval whole: a polynomial through a few widths then serves all of them.
+    as long as no end of the interval cuts it: a polynomial through a few widths then serves all of them.
     """
     low, high = float(np.min(share)), float(np.max(share))
     reach = 0.5 * PULSES_EACH * high
-    whole = [0.0 <= centre - reach - gone and centre + reach - gone <= 1.0 for centre in PULSE_CENTRES]
-    outside = [centre + reach - gone <= 0.0 or centre - reach - gone >= 1.0 for centre in PULSE_CENTRES]
-    if all(outside):
+    if all(abs(centre - gone - 0.5) >= 0.5 + reach for centre in PULSE_CENTRES):
         return np.zeros((2, len(share)))
-    if not all(inside or out for inside, out in zip(whole, outside, strict=True)) or high - low < LEAST_SPREAD:
+    cut = [abs(centre - gone - end) < reach for centre in PULSE_CENTRES for end in (0.0, 1.0)]
+    if any(cut) or high - low < LEAST_SPREAD:
         return _charged_exactly(model, share, gone, period_s)
     middle, half = 0.5 * (high + low), 0.5 * (high - low)
     coefficients = WIDTHS_TO_POWERS @ _charged_exactly(model, middle + half * WIDTH_NODES, gone, period_s).T
