@@ -104,7 +104,7 @@ def make_folder(path: Path, *, hint: str = "choose another folder") -> None:
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", where=str(path), hint=hint) from None
+        raise ConfigError(f"cannot be made: {error.strerror}", where=str(path), hint=hint) from None
 
 
 def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: str = "choose another folder") -> None:

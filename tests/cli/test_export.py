@@ -193,7 +193,7 @@ BAD = {
     "prefix": (["header", "params.toml", "--prefix", "2x", "-o", "out"], "prefix"),
     "map without sheet": (["dcf", "params.toml", "--map", "map.toml"], "needs --into"),
     "no folder": (["csv", "params.toml", "-o", "nowhere/out"], "cannot be written"),
-    "a file in the way": (["c", "params.toml", "-o", "params.toml/c"], "cannot be written"),
+    "a file in the way": (["c", "params.toml", "-o", "params.toml/c"], "cannot be made"),
 }
 
 
