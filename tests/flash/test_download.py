@@ -173,7 +173,7 @@ def test_unwritable_folder_is_refused_before_writing(rig: Rig, tmp_path: Path) -
     blocked.write_text("not a folder")
     rig.root = blocked
     before = rig.image()
-    with pytest.raises(ConfigError, match="cannot be written"):
+    with pytest.raises(ConfigError, match="cannot be made"):
         rig.download(SMALL)
     assert rig.image() == before
 
