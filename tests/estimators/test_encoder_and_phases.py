@@ -2,6 +2,7 @@
 """Pole pairs, direction, coarse offset; the three-vector phase check; noise; the table of refusals."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_enc
 from pmsmtool.estimators.estimate import SensorTolerance, Verdict
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise, estimate_noise
-from pmsmtool.estimators.phase_check import check_pairs, check_phases, over_phases
+from pmsmtool.estimators.phase_check import BALANCE_LIMIT, SMALL_LIMIT, check_pairs, check_phases, over_phases
 from pmsmtool.estimators.refusals import REFUSALS, refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.estimators.sensor_mismatch import SensorMismatch, widened, without_mismatch
@@ -143,6 +144,16 @@ def test_a_bad_motor_is_named(phases: tuple[float, float, float], reason: str) -
     with pytest.raises(IdentificationError) as caught:
         check_phases(vectors(phases=phases), NOISE)
     assert caught.value.reason == reason
+
+
+def test_an_unequal_motor_is_told_by_how_much() -> None:
+    with pytest.raises(IdentificationError) as caught:
+        check_phases(vectors(phases=(1.0, 0.85, 1.0)), NOISE)
+    numbers = [float(x) for x in re.findall(r"([0-9.e+-]+) %", caught.value.what)]
+    i = (1.0, 0.85, 1.0)  # the spread is of the mean
+    assert numbers[0] == pytest.approx(100.0 * 0.15 / np.mean(i), rel=0.05)
+    assert numbers[2] == 100.0 * BALANCE_LIMIT and numbers[4] == 100.0 * SMALL_LIMIT
+    assert numbers[3] == pytest.approx(100.0 * (1.0 / 0.85 - 1.0) / np.mean(np.divide(1.0, i)), rel=0.05)
 
 
 def test_an_encoder_that_does_not_count_is_named_and_a_slow_one_is_not() -> None:

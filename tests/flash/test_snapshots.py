@@ -8,6 +8,8 @@ import pytest
 
 from pmsmtool.cli.main import run
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive_maps.eds import Eds, EdsObject
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError
 from pmsmtool.flash.journal import (
     DamagedSnapshot,
@@ -19,7 +21,9 @@ from pmsmtool.flash.journal import (
     read_snapshot,
     write_snapshot,
 )
-from pmsmtool.flash.restore import take_backup
+from pmsmtool.flash.restore import check_snapshot, take_backup
+from pmsmtool.flash.whole_drive import _stated_vendor
+from pmsmtool.params.catalogue import layout_signature
 from tests.flash.rig import SMALL, open_rig
 from tests.simulated_bus import settle
 
@@ -135,6 +139,29 @@ def test_verify_compares_with_no_backup_of_another_drive(tmp_path, monkeypatch, 
     assert run([*BUS, "verify", "b.json"]) == 2
     printed = capsys.readouterr()
     assert said in printed.err and printed.out == ""
+
+
+@pytest.mark.parametrize(("vendor", "refused"), [(0, True), (1, False)])
+def test_drives_that_name_no_vendor_are_told_apart_by_their_name(vendor, refused):
+    drive = replace(IDENTITY, vendor=vendor)
+    mine = replace(SNAPSHOT, identity=drive, entries=(), signature=layout_signature())
+    check_snapshot(load_family("pmsmsim"), mine, drive)
+    other = replace(mine, identity=replace(drive, name="another"))
+    if refused:
+        with pytest.raises(ConfigError, match="calls itself 'drive', not 'another'"):
+            check_snapshot(load_family("pmsmsim"), other, drive)
+    else:
+        check_snapshot(load_family("pmsmsim"), other, drive)
+
+
+@pytest.mark.parametrize(
+    ("value", "default", "vendor"),
+    [("0x9A", "1", 0x9A), ("", "0x9A", 0x9A), ("7", "", 7), ("", "", 0), ("?", "", None)],
+)
+def test_a_data_sheet_states_its_vendor_by_value_or_default(value, default, vendor):
+    item = EdsObject(0x1018, 1, "Vendor-ID", 0x07, "ro", None, None, default, value, 1)
+    assert _stated_vendor(Eds({(0x1018, 1): item}, None, None, None, "", None, "utf-8", ())) == vendor
+    assert _stated_vendor(Eds({}, 5, None, None, "", None, "utf-8", ())) is None
 
 
 def test_a_spare_part_is_compared_when_that_is_asked_for(tmp_path, monkeypatch, capsys, backup):
