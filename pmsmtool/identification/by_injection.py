@@ -126,12 +126,14 @@ def evaluation_of(run: RunDirectory, nameplate: MachineFile, request: IdentifyRe
 @lru_cache(maxsize=1)
 def _evaluation(question: _Question) -> Evaluation:
     run, nameplate, request = question.run, question.nameplate, question.request
+    inverter = nameplate.inverter
     return evaluate(
         stored_traces(run),
-        nameplate.inverter.T_s,
+        inverter.T_s,
         copper=copper_of(nameplate),
         alpha_psi_per_k=nameplate.machine.alpha_psi_per_k,
-        U_dc_v=nameplate.inverter.U_dc_v,
+        U_dc_v=inverter.U_dc_v,
+        plateau_v=inverter.U_dc_v * inverter.dead_time_s * inverter.f_s_hz,
         tolerance=replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(nameplate.machine)),
         ended=refused_in(run),
     )

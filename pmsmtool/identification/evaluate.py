@@ -174,6 +174,7 @@ def evaluate(
     U_dc_v: float = math.inf,
     tolerance: SensorTolerance | None = None,
     ended: Mapping[str, IdentificationError] | None = None,
+    plateau_v: float = 0.0,
 ) -> Evaluation:
     """Estimate everything the traces allow; what is refused takes only what depends on it along.
 
@@ -198,6 +199,8 @@ def evaluate(
         Declared sensor tolerances.
     ended : mapping of str to IdentificationError, optional
         Experiments that were refused while they ran, by the keys of ``Evaluation.refused``: their traces are not whole.
+    plateau_v : float
+        As of ``estimators/resistance.py`` (V).
 
     Raises
     ------
@@ -232,7 +235,7 @@ def evaluate(
 
     if "levels" in traces:
         result = replace(result, supply=supply_under_load(traces["zero_current"], traces["levels"]))
-        R = attempt("R", lambda: resistance_of(traces["levels"], result.noise, copper, tolerance))
+        R = attempt("R", lambda: resistance_of(traces["levels"], result.noise, copper, tolerance, plateau_v))
         if R is not None:
             R = replace(R, R_s=widened(R.R_s, mismatch), R_measured=widened(R.R_measured, mismatch))
             result = replace(result, resistance=R)
@@ -309,11 +312,15 @@ def with_equal_sensors(traces: Mapping[str, Trace], mismatch: SensorMismatch | N
 
 
 def resistance_of(
-    levels: Trace, noise: Noise, copper: Copper | None = None, tolerance: SensorTolerance | None = None
+    levels: Trace,
+    noise: Noise,
+    copper: Copper | None = None,
+    tolerance: SensorTolerance | None = None,
+    plateau_v: float = 0.0,
 ) -> ResistanceResult:
     """Return the resistance at a reference temperature; levels at which the shaft moved are left out, and counted."""
     levels, left_out = settled_levels(levels, noise)
-    result = estimate_resistance(levels, noise, tolerance=tolerance, copper=copper)
+    result = estimate_resistance(levels, noise, tolerance=tolerance, copper=copper, plateau_v=plateau_v)
     if not left_out:
         return result
     note = f"{left_out} levels left out: shaft or voltage moved during them"

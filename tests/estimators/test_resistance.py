@@ -15,6 +15,7 @@ from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import (
     R_MEASURED,
+    WITHIN_KNEE,
     Copper,
     ResistanceResult,
     at_the_test,
@@ -201,6 +202,35 @@ def test_a_link_that_falls_with_the_power_takes_no_part_of_R() -> None:
     assert count <= 2  # measured 0 (seed 12: one of 60, and one drive 2.9 times beyond its interval at 12 %)
     assert np.mean(np.array(ratios) > 1.0) <= 0.05 and max(ratios) < 1.5  # measured 1 of 60, 1.02
     assert np.mean(np.array(blind) > 2.0) > 0.5  # measured 0.98
+
+
+@pytest.mark.chain
+def test_levels_within_the_knee_of_the_inverters_error_say_so() -> None:
+    """A motor that is small for its bridge: what looks like R is R and the slope of the error, whatever its shape."""
+    rng = np.random.default_rng(14)
+    d = draw(60, rng)
+    small = replace(d, knee=rng.uniform(0.6, 3.0, 60) * d.I_r, drop=np.zeros(60))
+    ratios: dict[bool, list[float]] = {True: [], False: []}
+    for k in range(60):
+        levels = levels_of(small, k, rng)
+        for told in ratios:
+            R = estimate_or_none(levels, noise_of(small, k), told * float(d.dV[k]))
+            if R is None:
+                continue
+            ratios[told].append(abs(R.value - d.R[k]) / total_half_width(R))
+            assert WITHIN_KNEE in R.fallback or ratios[told][-1] <= 1.0 or not told
+        usual = estimate_or_none(levels_of(d, k, rng), noise_of(d, k), float(d.dV[k]))
+        assert usual is None or WITHIN_KNEE not in usual.fallback
+    assert len(ratios[True]) >= 55 and max(ratios[True]) <= 1.0  # measured 58, 0.63
+    assert np.mean(np.array(ratios[False]) > 2.0) > 0.5  # measured 0.57: without the dead time nothing shows how much
+
+
+def estimate_or_none(levels: Trace, noise: Noise, plateau_v: float) -> Estimate | None:
+    """Return R at the temperature of the test, None where it is refused."""
+    try:
+        return estimate_resistance(levels, noise, plateau_v=plateau_v).R_measured
+    except IdentificationError:
+        return None
 
 
 def test_zeros_of_the_current_sensors_are_no_model_mismatch() -> None:
