@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,13 @@ from pmsmtool.identification.by_injection import evaluated_stage
 from pmsmtool.identification.request import IdentifyRequest, steps_of
 from pmsmtool.identification.run_files import NAMEPLATE, PREDICTED, REFUSED, dump_predicted, dump_refused
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.machine.parameters import EncoderParameters, InverterParameters, MachineLimits, MachineParameters
+from pmsmtool.machine.parameters import (
+    HALLS,
+    EncoderParameters,
+    InverterParameters,
+    MachineLimits,
+    MachineParameters,
+)
 from pmsmtool.measurement import flux_map, frequency_response, mechanics
 from pmsmtool.measurement.limits import DURATION_S, HEADROOM, Limits, require_speed, unused_current
 from pmsmtool.measurement.measure import Measurement, starting_gains
@@ -72,10 +78,17 @@ def nameplate_of(drive: CanopenDrive, name: str = "") -> MachineFile:
         name,
         machine,
         inverter,
-        encoder=EncoderParameters(),
+        encoder=_encoder(read),
         limits=limits,
         provenance={"source": "parameter set and ratings of the drive; the measured values are in [estimate]"},
     )
+
+
+def _encoder(read: Callable[[str], float]) -> EncoderParameters:
+    """Return how the drive commutates by Hall sensors; nothing where it does not. The rest is measured."""
+    kind = round(read("hall.commutation"))
+    axes = [read(f"hall.{key}") if kind else None for key in HALLS[1:]]
+    return EncoderParameters(0.0, 1, None, kind or None, *axes)
 
 
 def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:

@@ -199,16 +199,25 @@ class ProofPlan:
         return ramps + sum(e.rows * e.decimation * T_s + 0.5 for e in self.experiments)
 
 
+HALL_ALONE = 2
+"""``hall.commutation`` from which on a drive has no encoder."""
+
+
 def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
     """Return the experiments that fit a design within an envelope.
 
     Raises
     ------
     NotAvailable
-        Not even current steps fit.
+        Not even current steps fit, or the design is for a drive that Hall sensors alone commutate.
     ConfigError
         The design gives no rated current.
     """
+    if design["hall.commutation"] >= HALL_ALONE:
+        raise NotAvailable(
+            "the tool predicts no drive that commutates by Hall sensors alone",
+            hint="compare moves and records by hand; `pmsmtool caps` lists what such a drive gives",
+        )
     sizes = _Sizes.of(design, conditions)
     experiments: list[Experiment] = []
     left_out: list[str] = []

@@ -55,6 +55,15 @@ def test_everything_the_issue_asks_for_is_there() -> None:
     assert sorted({abs(share) for share in STEPS if share}) == [0.5, 1.0] and sum(STEPS) == 0.0
 
 
+def test_a_drive_without_an_encoder_is_not_predicted() -> None:
+    made = design()
+    for kind in (0, 1):
+        plan_proof(changed(made, hall__commutation=kind), conditions(made))
+    for kind in (2, 3):
+        with pytest.raises(NotAvailable, match="Hall sensors alone"):
+            plan_proof(changed(made, hall__commutation=kind), conditions(made))
+
+
 def test_a_drive_without_what_a_move_needs_is_told() -> None:
     made = design()
     J = Estimate(0.0364, 8e-4, 0.0, "kg m2", fallback=f"{PLAY_FALLBACK}: 0.0193 by a small torque, 0.0364 by pulses")
