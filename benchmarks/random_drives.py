@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Drives drawn at random, to judge identification and design by numbers instead of examples.
 
-Two draws. :func:`draw_drive` takes a whole drive from the population below; :func:`draw_around` varies a given
-machine file. The ranges are fixed here, before any run, and every drive follows from its seed alone. What is drawn
-goes into ``[simulation]`` (the truth) and into the nameplate; the tool sees the nameplate only. Half of the encoders
-count against the phase order, half of the machines have two leads swapped, winding and magnets have 5 to 90 degC.
+Three draws. :func:`draw_drive` takes a whole drive from the population below, :func:`draw_wide` one from a much wider
+one; :func:`draw_around` varies a given machine file. The ranges are fixed here, before any run, and every drive follows
+from its seed alone. What is drawn goes into ``[simulation]`` (the truth) and into the nameplate; the tool sees the
+nameplate only. Half of the encoders count against the phase order, half of the machines have two leads swapped, winding
+and magnets have 5 to 90 degC.
 """
 
 from __future__ import annotations
@@ -124,6 +125,64 @@ def draw_drive(seed: int, block: Block = "ideal") -> MachineFile:
             offset_rad=0.0, direction=1, bits=int(rng.integers(ENCODER_BITS[0], ENCODER_BITS[1] + 1))
         ),
         limits=MachineLimits(i_trip_apk=1.35 * 1.5 * I_nom, I_cont_apk=I_nom),
+    )
+    return _with_truth(drive, kind, rng, seed, block)
+
+
+WIDE_U_DC_V = (12.0, 24.0, 48.0, 96.0, 160.0, 325.0, 560.0, 800.0)
+WIDE_POWER_W = (5.0, 6e4)
+WIDE_CURRENT_A = (0.1, 250.0)
+WIDE_FREQUENCY_HZ = (20.0, 1000.0)
+"""Electrical frequency at the largest speed, at most a fourteenth of the control frequency."""
+WIDE_EMF_SHARE = (0.55, 0.95)
+"""Back-emf at the largest speed, of U_dc/sqrt(3)."""
+WIDE_RESISTIVE_SHARE, WIDE_INDUCTIVE_SHARE, WIDE_RIPPLE_SHARE = (0.01, 0.08), (0.05, 0.6), 0.5
+"""Of that emf at the rated current; the ripple of the current, from peak to peak, at most that share of it."""
+WIDE_SALIENCY, WIDE_POLE_PAIRS, WIDE_ENCODER_BITS = (1.0, 2.5), (1, 24), (11, 23)
+WIDE_ACCELERATION_S, WIDE_FRICTION_SHARE = (0.02, 1.5), (0.003, 0.12)
+
+
+def draw_wide(seed: int, block: Block = "ideal") -> MachineFile:
+    """Return drive number ``seed`` of a population from the motor of a watch to that of a lorry.
+
+    5 W to 60 kW at 12 to 800 V, 1 to 24 pole pairs, 20 to 1000 Hz; one half is not salient; friction takes 0.3 to 12 %
+    of the rated torque.
+    """
+    rng = np.random.default_rng([20261126, seed])
+    U_dc = float(rng.choice(WIDE_U_DC_V))
+    kind = LOW_VOLTAGE if U_dc <= LOW_VOLTAGE.U_dc_v[-1] else HIGH_VOLTAGE
+    f_s = _log_uniform(rng, kind.f_s_hz)
+    omega = 2.0 * math.pi * min(f_s / 14.0, _log_uniform(rng, WIDE_FREQUENCY_HZ))
+    emf = float(rng.uniform(*WIDE_EMF_SHARE)) * U_dc / math.sqrt(3.0)
+    I_nom = float(np.clip(_log_uniform(rng, WIDE_POWER_W) / (1.5 * emf), *WIDE_CURRENT_A))
+    pole_pairs = int(rng.integers(WIDE_POLE_PAIRS[0], WIDE_POLE_PAIRS[1] + 1))
+    rippling = U_dc / (8.0 * f_s * WIDE_RIPPLE_SHARE * I_nom)
+    L_d = max(_log_uniform(rng, WIDE_INDUCTIVE_SHARE) * emf / (omega * I_nom), rippling)
+    tau_nom, omega_M = torque_per_ampere(pole_pairs, emf / omega) * I_nom, omega / pole_pairs
+    machine = MachineParameters(
+        pole_pairs=pole_pairs,
+        R_s_ohm=float(rng.uniform(*WIDE_RESISTIVE_SHARE)) * emf / I_nom,
+        L_d_h=L_d,
+        L_q_h=L_d * (float(rng.uniform(*WIDE_SALIENCY)) if rng.random() < 0.5 else 1.0),
+        psi_f_wb=emf / omega,
+        I_nom_apk=I_nom,
+        I_max_apk=float(rng.uniform(1.3, 2.5)) * I_nom,
+        I_max_time_s=10.0,
+        n_nom_rpm=rpm_from_rad_s(float(rng.uniform(0.5, 0.9)) * omega_M),
+        n_max_rpm=rpm_from_rad_s(omega_M),
+        J_kgm2=tau_nom * _log_uniform(rng, WIDE_ACCELERATION_S) / omega_M,
+        B_nms=0.002 * tau_nom / omega_M,
+        tau_c_nm=_log_uniform(rng, WIDE_FRICTION_SHARE) * tau_nom,
+    )
+    inverter = InverterParameters(U_dc_v=U_dc, f_s_hz=f_s, dead_time_s=_log_uniform(rng, kind.dead_time_s))
+    bits = int(rng.integers(WIDE_ENCODER_BITS[0], WIDE_ENCODER_BITS[1] + 1))
+    trip = 1.35 * (machine.I_max_apk or I_nom)
+    drive = MachineFile(
+        name=f"wide-{seed}",
+        machine=machine,
+        inverter=inverter,
+        encoder=EncoderParameters(offset_rad=0.0, direction=1, bits=bits),
+        limits=MachineLimits(i_trip_apk=trip, I_cont_apk=I_nom),
     )
     return _with_truth(drive, kind, rng, seed, block)
 

@@ -3,6 +3,7 @@
 
     python -m benchmarks.whole_commission --drives 200 --first 120000 --results results.jsonl
     python -m benchmarks.whole_commission --real --drives 400 --first 160000 --results real.jsonl
+    python -m benchmarks.whole_commission --wide --drives 40 --first 1000 --results wide.jsonl
     python -m benchmarks.whole_commission --second-plant --drives 60 --first 170000 --results second.jsonl
 
 Drives follow from their seeds (``random_drives.py``: switched inverter, half of the encoders reversed, half of
@@ -24,14 +25,14 @@ import statistics
 import struct
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from benchmarks import second_plant
 from benchmarks.commissioning import QUANTITIES, commanded, errors_of, prepared
-from benchmarks.random_drives import Block, data_sheet, draw_drive, true_loop_resistance
+from benchmarks.random_drives import Block, data_sheet, draw_drive, draw_wide, true_loop_resistance
 from benchmarks.real_population import draw_real
 from pmsmtool.commissioning.report_page import verdict
 from pmsmtool.estimators.estimate import total_half_width
@@ -105,9 +106,21 @@ def commission_one(seed: int, drive: MachineFile | None = None) -> dict[str, Any
     return {**result, "seconds": time.process_time() - start}
 
 
-def commission_job(seed: int, *, real: bool, second: bool) -> dict[str, Any]:
+def commission_wide(seed: int) -> dict[str, Any]:
+    """Commission one drive of the *wide* population."""
+    return commission_one(seed, draw_wide(seed, BLOCKS[seed % len(BLOCKS)]))
+
+
+POPULATIONS: dict[str, Callable[[int], dict[str, Any]]] = {
+    "clean": commission_one,
+    "real": commission_real,
+    "wide": commission_wide,
+}
+
+
+def commission_job(seed: int, *, population: str, second: bool) -> dict[str, Any]:
     """Commission one drive of a population, on the project's plant or on the second one."""
-    commission = commission_real if real else commission_one
+    commission = POPULATIONS[population]
     if not second:
         return commission(seed)
     with second_plant.used() as digest:
@@ -151,7 +164,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--drives", type=int, default=200)
     parser.add_argument("--first", type=int, default=120_000, help="first seed")
-    parser.add_argument("--real", action="store_true", help="with effects of real machines (real_population.py)")
+    for flag, text in (
+        ("real", "with effects of real machines (real_population.py)"),
+        ("wide", "from 5 W to 60 kW (random_drives.draw_wide)"),
+    ):
+        parser.add_argument(f"--{flag}", dest="population", action="store_const", const=flag, help=text)
+    parser.set_defaults(population="clean")
     parser.add_argument("--second-plant", action="store_true", help="motor, shaft and bridge of second_plant/")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--results", type=Path, default=Path("whole_commission.jsonl"))
@@ -161,7 +179,7 @@ def main() -> None:
     if asked.second_plant:
         second_plant.build()
         print(f"second plant, sha256 of its sources {second_plant.digest()}", flush=True)
-    commission = functools.partial(commission_job, real=asked.real, second=asked.second_plant)
+    commission = functools.partial(commission_job, population=asked.population, second=asked.second_plant)
     with multiprocessing.Pool(asked.processes, maxtasksperchild=1) as pool, asked.results.open("a") as file:
         for result in pool.imap_unordered(commission, seeds, chunksize=1):
             file.write(json.dumps(result) + "\n")
