@@ -7,6 +7,7 @@ Numbers are decoded as they are when the drive is asked: :data:`~pmsmtool.drive.
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -110,12 +111,8 @@ class LoggedDrive:
         self._asked: tuple[Address, bytes] | None = None
         self._layouts: dict[int, list[tuple[Address, int]]] | None = None
         for (index, sub), item in () if sheet is None else sheet.objects.items():
-            text = item.value or item.default
-            if self._is_of_a_pdo(index) and text:
-                try:
-                    self._pdo[index, sub] = parse_integer(text, node)
-                except ValueError:
-                    continue
+            with contextlib.suppress(ValueError):  # no number, as most objects of it
+                self._pdo[index, sub] = parse_integer(item.value or item.default, node)
 
     @staticmethod
     def _is_of_a_pdo(index: int) -> bool:
