@@ -198,6 +198,16 @@ def test_steady_current_of_table_1_is_the_optimum(mode: int, rpm: float, torque:
     assert pytest.approx(6 * (0.41 + 0.0002 * expected[0]) * expected[1], abs=BIAS_NM) == T
 
 
+def test_on_the_bound_of_i_d_the_current_keeps_its_limit() -> None:
+    """A salient machine that wants more i_d than it may have, and all torque: the corner of bound and circle."""
+    values = weakening(ACCELERATED, field_weakening__h2=1e-3, field_weakening__iterations=20) | SALIENT
+    values["field_weakening.i_d_min_a"] = -30.0
+    loop = Loop(core(), values, omega=300 * RPM, U_dc=100 / 0.92 * math.sqrt(3))
+    for _ in range(2000):
+        live = loop.step(mode=MODE_TORQUE, tau_ref=250.0)
+    assert (live.i_d_req, live.i_q_req) == pytest.approx((-30.0, math.sqrt(150.0**2 - 30.0**2)), abs=0.2)
+
+
 def test_only_the_ratio_of_the_weights_counts() -> None:
     """Both four times as large or small, which binary numbers bear exactly: the same steps, the same current."""
     runs = []
