@@ -130,6 +130,8 @@ def draw_drive(seed: int, block: Block = "ideal") -> MachineFile:
 
 
 WIDE_U_DC_V = (12.0, 24.0, 48.0, 96.0, 160.0, 325.0, 560.0, 800.0)
+WIDE_MOSFET_V = 160.0
+"""DC link up to which bridges are made of MOSFETs."""
 WIDE_POWER_W = (5.0, 6e4)
 WIDE_CURRENT_A = (0.1, 250.0)
 WIDE_FREQUENCY_HZ = (20.0, 1000.0)
@@ -150,7 +152,7 @@ def draw_wide(seed: int, block: Block = "ideal") -> MachineFile:
     """
     rng = np.random.default_rng([20261126, seed])
     U_dc = float(rng.choice(WIDE_U_DC_V))
-    kind = LOW_VOLTAGE if U_dc <= LOW_VOLTAGE.U_dc_v[-1] else HIGH_VOLTAGE
+    kind = LOW_VOLTAGE if U_dc <= WIDE_MOSFET_V else HIGH_VOLTAGE
     f_s = _log_uniform(rng, kind.f_s_hz)
     omega = 2.0 * math.pi * min(f_s / 14.0, _log_uniform(rng, WIDE_FREQUENCY_HZ))
     emf = float(rng.uniform(*WIDE_EMF_SHARE)) * U_dc / math.sqrt(3.0)
