@@ -48,10 +48,11 @@ class Trace:
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
         """Return one signal; raises ``KeyError`` with the nearest name where there is none."""
-        if name not in self.signals:
+        try:
+            return self.signals[name]
+        except KeyError:
             near = get_close_matches(name, self.signals, n=1)
-            raise KeyError(f"no signal {name!r}" + (f"; did you mean {near[0]}?" if near else ""))
-        return self.signals[name]
+            raise KeyError(f"no signal {name!r}" + (f"; did you mean {near[0]}?" if near else "")) from None
 
     def __repr__(self) -> str:
         span = f" from {self.t_s[0]:.6g} to {self.t_s[-1]:.6g} s" if len(self) else ""

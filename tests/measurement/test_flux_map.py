@@ -132,7 +132,7 @@ def test_the_measured_machine_with_its_rotor_held(tmp_path: Path) -> None:
             guard.enable()
             curve = InverterCurve(np.array([0.2, 0.5, 1.0, 5.0, 11.0]), np.array([5.0, 9.8, 11.8, 13.5, 13.7]), 0.0)
             R = Estimate(0.643, 0.002, 0.0, "ohm", T_c=25.0)
-            resistance = ResistanceResult(R, R, curve, 13.8, 0.0, 2.0, "pass")  # type: ignore[arg-type]
+            resistance = ResistanceResult(R, R, curve, 13.8, 0.0, "pass")  # type: ignore[arg-type]
             noise: Noise = estimate_noise(zero_current)
 
             def keep(name: str, trace: Trace) -> None:

@@ -203,7 +203,7 @@ def test_what_was_observed_until_an_interrupt_is_kept(
     before = stored(node)
     arguments = ["track", "-i", "pmsmsim", "-c", CHANNEL, "--by", by, "--for", "60s"]
     with monkeypatch.context() as patched:
-        interrupt_at(bus.clock.now() + 6.3, patched)
+        interrupt_at(bus.clock.now() + 6.8, patched)
         assert program(arguments) == 130
     (path,) = Path("runs").iterdir()
     told = capsys.readouterr().err

@@ -15,7 +15,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.drive_maps.drive_map import REFERENCE_VENDOR
 from pmsmtool.errors import ConfigError
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
@@ -26,6 +25,7 @@ from pmsmtool.sim.foreign.laws import Law
 from pmsmtool.sim.foreign.position import PositionLoop
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
+from pmsmtool.sim.node.node import VENDOR
 from pmsmtool.sim.node.objects import ObjectRow
 
 if TYPE_CHECKING:
@@ -199,7 +199,7 @@ def unheld_of(file: str, machine_file: MachineFile) -> tuple[str, ...]:
         As ``file_rows.read_makers_objects``; or the file is that of the reference drive, which is simulated itself.
     """
     objects = read_makers_objects(file)
-    if objects.stored(0x1018, 1) == REFERENCE_VENDOR:
+    if objects.stored(0x1018, 1) == VENDOR:
         raise ConfigError(
             "the file is that of the reference drive, no other maker's", where=file,
             hint="give MACHINE as --sim MACHINE: that is the reference drive with this motor",
