@@ -1,17 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""What is printed: text that is harmless whoever wrote it, as wide as a terminal; values as plain JSON types."""
+"""What is printed: text that is harmless whoever wrote it, in lines and tables as wide as a terminal."""
 
 from __future__ import annotations
 
-import dataclasses
-import enum
-import math
-import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from itertools import zip_longest
 from textwrap import wrap
-from typing import Any
 
 LONGEST_REASON = 300
 """Letters of another library's error message that are shown."""
@@ -89,40 +84,6 @@ def folded(line: str, width: int, *, hanging: int = 2) -> list[str]:
         line[start:], width, initial_indent=line[:start], replace_whitespace=False, break_long_words=False,
         subsequent_indent=" " * (start if start > lead else lead + hanging), break_on_hyphens=hanging == 0,
     )  # fmt: skip
-
-
-def jsonable(value: Any) -> Any:
-    """Return a value as plain JSON types.
-
-    Dataclasses become objects, arrays lists, numbers stay SI numbers without formatting; what is not a finite
-    number becomes null, because JSON has no other word for it.
-
-    Raises
-    ------
-    TypeError
-        A type that has no obvious JSON form.
-    """
-    if isinstance(value, enum.Flag):
-        return jsonable(value.value)
-    if isinstance(value, enum.Enum):
-        return value.name.lower().replace("_", "-")
-    if value is None or isinstance(value, (bool, int, str)):
-        return value
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {field.name: jsonable(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {str(jsonable(key)): jsonable(entry) for key, entry in value.items()}
-    if isinstance(value, (set, frozenset)):
-        return [jsonable(entry) for entry in sorted(value)]
-    if hasattr(value, "tolist"):  # a numpy array or scalar, without importing numpy here
-        return jsonable(value.tolist())
-    if isinstance(value, Iterable) and not isinstance(value, (bytes, bytearray)):
-        return [jsonable(entry) for entry in value]
-    raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
 def _is_number(text: str) -> bool:

@@ -7,6 +7,8 @@ Files a command writes, and the run directory or file it is given.
 from __future__ import annotations
 
 import dataclasses
+import enum
+import math
 import os
 import re
 import shutil
@@ -20,10 +22,44 @@ import click
 from pmsmtool import plain_text
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import write_file
-from pmsmtool.plain_text import folded, jsonable, one_line, plain
+from pmsmtool.plain_text import folded, one_line, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+def jsonable(value: Any) -> Any:
+    """Return a value as plain JSON types.
+
+    Dataclasses become objects, arrays lists, numbers stay SI numbers without formatting; what is not a finite
+    number becomes null, because JSON has no other word for it.
+
+    Raises
+    ------
+    TypeError
+        A type that has no obvious JSON form.
+    """
+    if isinstance(value, enum.Flag):
+        return jsonable(value.value)
+    if isinstance(value, enum.Enum):
+        return value.name.lower().replace("_", "-")
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: jsonable(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(jsonable(key)): jsonable(entry) for key, entry in value.items()}
+    if isinstance(value, (set, frozenset)):
+        return [jsonable(entry) for entry in sorted(value)]
+    if hasattr(value, "tolist"):  # a numpy array or scalar, without importing numpy here
+        return jsonable(value.tolist())
+    if isinstance(value, Iterable) and not isinstance(value, (bytes, bytearray)):
+        return [jsonable(entry) for entry in value]
+    raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[object]], indent: int = 0) -> list[str]:
@@ -92,7 +128,7 @@ class Output:
         command : str
             Name in the schema, ``pmsmtool.<command>/1``.
         data : mapping
-            What ``--json`` prints: SI numbers, see :func:`plain_text.jsonable`.
+            What ``--json`` prints: SI numbers, see :func:`jsonable`.
         text : lines, or a function that makes them
             What a person reads.
         """

@@ -170,7 +170,7 @@ def _content(row: Row, found: Reproduction, suffix: str, csv_text: Any) -> str:
         return "\n".join((*_text(row, found), ""))
     import json
 
-    from pmsmtool.plain_text import jsonable
+    from pmsmtool.cli.output import jsonable
 
     content = {"schema": "pmsmtool.reproduce/1", **_data(row, found), "panels": _series(found)}
     return json.dumps(jsonable(content), allow_nan=False, indent=1) + "\n"

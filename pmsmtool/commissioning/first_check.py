@@ -28,6 +28,7 @@ from pmsmtool.identification.wiring import (
     judge_supply,
     judge_turn,
 )
+from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import COMPENSATION, starting_gains
@@ -178,7 +179,7 @@ def _look(
     )  # fmt: skip
     found += [judge_supply(rest_v, turn, stated.inverter.U_dc_v), *judge_turn(turn, pole_pairs, against)]
     if halls and found[-1].verdict != NOT_SEEN:
-        used = drive.read("hall.commutation") > 0.5
+        used = round(drive.read("hall.commutation")) != HallCommutation.NONE
         axes = [drive.read(f"hall.axis_{wire}_rad") for wire in (1, 2, 3)] if used else []
         found.append(judge_halls(turn, axes))
 

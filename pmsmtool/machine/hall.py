@@ -5,12 +5,25 @@ from __future__ import annotations
 
 import itertools
 import math
+from enum import IntEnum
 
 PHASES = "abc"
 HALL_ORDERS = tuple("".join(order) for order in itertools.permutations(PHASES))
 """Phase whose sensor is on wires 1, 2 and 3."""
 HALL_SECTOR_RAD = math.pi / 3.0
 """Angle over which no wire changes, electrical."""
+
+
+class HallCommutation(IntEnum):
+    """Values of ``hall.commutation``, the enum ``pmsm_hall_commutation`` of the exported C."""
+
+    NONE = 0
+    START = 1
+    """Until the encoder counts from its index."""
+    ALONE = 2
+    """In place of an encoder."""
+    STEPS = 3
+    """The same, in a frame that stands in the middle of the sector: six steps per turn."""
 
 
 def hall_axis(phase: str) -> float:

@@ -35,6 +35,8 @@ from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of,
 from pmsmtool.drive_maps.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
 from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.identification.request import Method
+from pmsmtool.machine.hall import HallCommutation
+from pmsmtool.params.catalogue import BY_NAME
 
 T = TypeVar("T")
 
@@ -67,10 +69,10 @@ FEATURES: Mapping[str, str] = {
     "encoder": "an encoder: between two edges of Hall sensors (hall.commutation) the angle is not measured",
     "frame": "a frame that turns with the rotor: not six steps (hall.commutation 3; 2 for this time)",
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
-    "vendor R": "the maker's identification of it, with its result, in a map that names this drive",
-    "vendor L": "the maker's identification of it, with its result, in a map that names this drive",
-    "vendor psi": "the maker's identification of it, with its result, in a map that names this drive",
-    "vendor poles": "the maker's identification of it, with its result, in a map that names this drive",
+    **dict.fromkeys(
+        ("vendor R", "vendor L", "vendor psi", "vendor poles"),
+        "the maker's identification of it, with its result, in a map that names this drive",
+    ),
     "line voltage": "the DC link (0x6079), or the machine's voltage in the drive map",
     "current": "its current (0x6078) or torque (0x6077)",
     "bench supply": "a bench supply whose power a person reads (`pmsmtool identify R --supply`)",
@@ -290,9 +292,8 @@ class Capabilities:
         return str(method or (best.method if best else ""))
 
 
-HALL_COMMUTATION = DriveObject(0x2014, 1, "B")
-STARTS_ONLY, SIX_STEPS = 1, 3
-"""By Hall sensors until the encoder has its index; beyond that there is no encoder."""
+_HALL = BY_NAME["hall.commutation"]
+HALL_COMMUTATION = DriveObject(_HALL.index, _HALL.sub, "B")
 UNDECIDED = "no source says whether its amperes are peak or rms: +-17 % more"
 MEASURING = (Method.INJECT, Method.RECORDER, Method.STANDARD, Method.VENDOR)
 """Methods that measure, the best first."""
@@ -358,8 +359,8 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
             "excitation": node.has(0x2050, 0x0E),
             "averages": node.has(0x2063, 3),
             "recorder": node.has(0x2060, 8),
-            "encoder": halls <= STARTS_ONLY,
-            "frame": halls < SIX_STEPS,
+            "encoder": halls < HallCommutation.ALONE,
+            "frame": halls < HallCommutation.STEPS,
         }
     named = identity.vendor != UNKNOWN_VENDOR and drive_map.is_for(*identity.vendor_product)
     found = {name for name, there in has.items() if there}

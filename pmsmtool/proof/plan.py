@@ -14,6 +14,7 @@ from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Shape
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.identification.frequency_response import NOTHING, RIGID, SHOWN
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, MEAN_FALLBACK, PLAY_FALLBACK
+from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import RAD_S_PER_RPM
 
@@ -82,8 +83,10 @@ MOVE_RAMP, MOVE_RAMP_STEPS = 2.0, 100.0
 """Ramp of its acceleration, in time constants of the speed loop, and its most steps (the core has memory for 128)."""
 MOVE_LEAST_INCREMENTS = 1.0
 """Least speed, in increments per step of the speed loop."""
-MOST_JERK = 4e9
-"""Increments/s3: what 0x60A4 (UNSIGNED32) holds."""
+MOST_COUNTS = 4e9
+"""Increments/s3 and /s2: what 0x60A4, 0x6083 and 0x6084 (UNSIGNED32) hold."""
+MOST_WAY = 2**30
+"""Increments of a move: half of what tells forth from back in 0x607A (INTEGER32)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,10 +202,6 @@ class ProofPlan:
         return ramps + sum(e.rows * e.decimation * T_s + 0.5 for e in self.experiments)
 
 
-HALL_ALONE = 2
-"""``hall.commutation`` from which on a drive has no encoder."""
-
-
 def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
     """Return the experiments that fit a design within an envelope.
 
@@ -213,7 +212,7 @@ def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
     ConfigError
         The design gives no rated current.
     """
-    if design["hall.commutation"] >= HALL_ALONE:
+    if design["hall.commutation"] >= HallCommutation.ALONE:
         raise NotAvailable(
             "the tool predicts no drive that commutates by Hall sensors alone",
             hint="compare moves and records by hand; `pmsmtool caps` lists what such a drive gives",
@@ -467,18 +466,21 @@ def _moves(s: _Sizes, increments: int) -> tuple[Experiment, ...] | str:
         return "position moves: nothing shows that the shaft is rigid and without play: no frequency response"
     if not increments:
         return "position moves: the drive does not state the increments of a turn (0x608F)"
+    unit = 2.0 * math.pi / increments
     acceleration = MOVE_ACCELERATION * slope * min(1.0, s.i_lim / s.design["motor.I_max_apk"])
+    acceleration = min(acceleration, MOST_COUNTS * unit)
     speed = min(s.omega_steps / s.p, MOVE_SPEED_SHARE * s.omega_max / s.p, MOVE_RISE * acceleration / K_p)
     step_s = s.T_s * s.design["speed.decimation"]
     ramp_s = min(max(MOVE_RAMP / s.crossover_rad_s, step_s), MOVE_RAMP_STEPS * step_s)
-    unit = 2.0 * math.pi / increments
-    jerk = min(acceleration / (ramp_s * unit), MOST_JERK)
+    jerk = min(acceleration / (ramp_s * unit), MOST_COUNTS)
     move = ProfileMove(0, round(speed / unit), max(1, round(acceleration / unit)), max(1, round(jerk)))
     if move.velocity < MOVE_LEAST_INCREMENTS / step_s:
         return f"position moves: {increments} increments of a turn are too coarse for {speed / RPM:.4g} rpm"
     rise_s, ramp_s = move.velocity / move.acceleration, move.acceleration / move.jerk
     at_speed_s = rise_s + ramp_s + MOVE_AT_SPEED / K_p
     move = replace(move, way=round(move.velocity * at_speed_s))
+    if move.way > MOST_WAY:
+        return f"position moves: {increments} increments of a turn are too fine for {speed / RPM:.4g} rpm"
     moving_s, settling_s = at_speed_s + rise_s + ramp_s, MOVE_SETTLE / K_p + 0.5 * SPEED_SETTLE / s.crossover_rad_s
     decimation = max(1, math.ceil((moving_s + settling_s) / (SPEED_ROWS * s.T_s)))
     steady = max(0, SPEED_ROWS - math.ceil((moving_s + 0.5 * settling_s) / (decimation * s.T_s)))

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from pmsmtool.cli.failure import report
-from pmsmtool.cli.output import Output, table
+from pmsmtool.cli.output import Output, jsonable, table
 from pmsmtool.errors import BusError
-from pmsmtool.plain_text import jsonable, reason
+from pmsmtool.plain_text import reason
 
 
 class Mode(enum.IntEnum):

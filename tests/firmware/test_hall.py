@@ -5,16 +5,19 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+import pmsmtool
 from pmsmtool.design.tune import tune
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.identification.hall import HallAlignment
-from pmsmtool.machine.hall import HALL_ORDERS
+from pmsmtool.machine.hall import HALL_ORDERS, HallCommutation
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.sim.closed_loop import drive_values
@@ -238,3 +241,11 @@ def test_a_speed_fades_where_the_next_edge_stays_away() -> None:
     assert abs(math.remainder(simulation.signal(Signal.THETA_E) - middle, 2 * math.pi)) < math.radians(
         4.0
     )  # measured 2.8
+
+
+def test_the_kinds_of_commutation_are_those_of_the_header() -> None:
+    header = (Path(pmsmtool.__file__).parent / "firmware/application/pmsm_application.h").read_text(encoding="utf-8")
+    declared = re.search(r"enum pmsm_hall_commutation \{(.*?)\}", header, re.DOTALL)
+    assert declared is not None
+    names = re.findall(r"PMSM_HALL_(\w+)", declared[1])
+    assert names == [kind.name for kind in HallCommutation] and list(HallCommutation) == list(range(len(names)))

@@ -75,6 +75,7 @@ def test_a_drive_without_what_a_move_needs_is_told() -> None:
         (plan_proof(changed(made, position__K_p_per_s=0.0), conditions(made)), "no position controller"),
         (plan_proof(made, conditions(made, encoder_counts=0)), "increments of a turn"),
         (plan_proof(made, conditions(made, encoder_counts=4)), "too coarse"),
+        (plan_proof(changed(made, position__K_p_per_s=0.1), conditions(made, encoder_counts=2**30)), "too fine"),
         (plan_proof(made, conditions(made, shaft="locked")), "locked shaft"),
     ):
         assert not [e for e in without.experiments if e.move is not None]
@@ -95,6 +96,16 @@ def test_a_shaft_that_is_shown_to_be_rigid_is_moved() -> None:
     made = design()
     plan = plan_proof(shown(made, RIGID), conditions(made))
     assert [e.name for e in plan.experiments][-2:] == ["move", "move_lag"] and plan.left_out == ()
+
+
+@pytest.mark.parametrize("bits", [16, 22, 23, 26, 28])
+def test_a_move_fits_the_objects_of_the_drive(bits: int) -> None:
+    """A spindle with an encoder of 22 bits: its acceleration did not fit 0x6083, and `prove` ended in exit 70."""
+    made = changed(design(), speed__acceleration_rpm_per_s=1e5)
+    for experiment in plan_proof(made, conditions(made, encoder_counts=2**bits)).experiments:
+        if (move := experiment.move) is not None:
+            assert 0 < move.velocity < 2**32 and 0 < move.acceleration < 2**32 and 0 < move.jerk < 2**32
+            assert 0 < abs(move.way) < 2**31
 
 
 @pytest.mark.chain
