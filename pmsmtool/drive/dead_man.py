@@ -185,6 +185,8 @@ def _set_consumer(drive: CanopenDrive) -> bool:
             raise _refused("all entries of the consumer heartbeat time are taken", drive)
         free.sort(key=lambda sub: entries[sub] >> 16 & 0xFF != TOOL_NODE)
         word = (TOOL_NODE << 16 | CONSUMER_MS).to_bytes(4, "little")
+        if entries[free[0]] == int.from_bytes(word, "little"):  # left by a run that was killed, not the owner's
+            node.sdo.download(objects.CONSUMER_HEARTBEAT, free[0], bytes(4))
         node.write_bytes(objects.CONSUMER_HEARTBEAT, free[0], word)
     except SdoAbort as abort:
         if abort.code in ABSENT:

@@ -154,6 +154,14 @@ def test_all_entries_taken_is_refused(bench: SimBench) -> None:
         pass
 
 
+@pytest.mark.parametrize(("held", "after"), [(CONSUMER_MS, 0), (CONSUMER_MS + 1, TOOL_NODE << 16 | CONSUMER_MS + 1)])
+def test_the_entry_a_killed_run_left_is_freed_and_an_owners_is_kept(bench: SimBench, held: int, after: int) -> None:
+    bench.drive.node.sdo.download(0x1016, 1, (TOOL_NODE << 16 | held).to_bytes(4, "little"))
+    with guarded(bench.drive, ENVELOPE) as guard:
+        assert guard.proof is not None
+    assert int.from_bytes(bench.drive.node.sdo.read(0x1016, 1), "little") == after
+
+
 def test_killed_tool_stops_the_machine(bench: SimBench) -> None:
     with guarded(bench.drive, ENVELOPE) as guard:
         guard.enable()
