@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pmsmtool.bus.connect import connect as connect
     from pmsmtool.commissioning.commission import commission as commission
+    from pmsmtool.commissioning.design_stages import lut as lut
     from pmsmtool.commissioning.parameter_source import load_parameters as load_parameters
     from pmsmtool.commissioning.report_page import report_page as report_page
     from pmsmtool.design.design_file import load_design as load_design
+    from pmsmtool.design.lookup.design import LookupRequest as LookupRequest
     from pmsmtool.design.loops.margins import margin_report as margin_report
     from pmsmtool.design.tolerance import tolerance_box as tolerance_box
     from pmsmtool.design.tune import tune as tune
@@ -53,6 +55,8 @@ _HOME = {
     "load_parameters": "pmsmtool.commissioning.parameter_source",
     "TuneRequest": "pmsmtool.design.tune_request",
     "tune": "pmsmtool.design.tune",
+    "LookupRequest": "pmsmtool.design.lookup.design",
+    "lut": "pmsmtool.commissioning.design_stages",
     "load_design": "pmsmtool.design.design_file",
     "tolerance_box": "pmsmtool.design.tolerance",
     "margin_report": "pmsmtool.design.loops.margins",
@@ -83,6 +87,8 @@ __all__ = [
     "load_parameters",
     "TuneRequest",
     "tune",
+    "LookupRequest",
+    "lut",
     "load_design",
     "tolerance_box",
     "margin_report",

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from html import escape
 from itertools import zip_longest
 from textwrap import wrap
+from typing import NamedTuple
 
 LONGEST_REASON = 300
 """Letters of another library's error message that are shown."""
@@ -68,6 +70,37 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[object]], width: int | N
             )
             lines.append("  ".join(aligned).rstrip())
     return lines
+
+
+class Summary(NamedTuple):
+    """What a result shows of itself: a line, a table by its heads and rows, and lines below it."""
+
+    head: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[object]]
+    notes: Sequence[str] = ()
+
+
+class Summarised:
+    """A result that shows a table of itself: as text, and as HTML in a notebook."""
+
+    __slots__ = ()
+
+    def summary(self) -> Summary:
+        """Return what is shown."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        shown = self.summary()
+        return "\n".join((shown.head, *table(shown.heads, shown.rows), *shown.notes))
+
+    def _repr_html_(self) -> str:
+        shown = self.summary()
+        rows = [("th", shown.heads), *(("td", row) for row in shown.rows)]
+        lines = ("".join(f"<{tag}>{escape(one_line(str(cell)))}</{tag}>" for cell in row) for tag, row in rows)
+        notes = "".join(f"<p>{escape(one_line(note))}</p>" for note in shown.notes)
+        body = "".join(f"<tr>{line}</tr>" for line in lines)
+        return f"<p>{escape(one_line(shown.head))}</p><table>{body}</table>{notes}"
 
 
 def folded(line: str, width: int, *, hanging: int = 2) -> list[str]:

@@ -6,16 +6,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.plain_text import table
+from pmsmtool.plain_text import Summarised, Summary
 
 
-@dataclass(frozen=True, slots=True)
-class Trace:
+@dataclass(frozen=True, slots=True, repr=False)
+class Trace(Summarised):
     """Samples of several signals at common instants.
 
     Row k of a drive trace holds the currents and the angle *sampled* at ``t_s[k]`` and the voltage
@@ -54,13 +55,21 @@ class Trace:
             near = get_close_matches(name, self.signals, n=1)
             raise KeyError(f"no signal {name!r}" + (f"; did you mean {near[0]}?" if near else "")) from None
 
-    def __repr__(self) -> str:
+    def summary(self) -> Summary:
+        """Return the range of each signal."""
         span = f" from {self.t_s[0]:.6g} to {self.t_s[-1]:.6g} s" if len(self) else ""
         rows = [
             (name, self.units[name], *((f"{values.min():.5g}", f"{values.max():.5g}") if len(self) else ("", "")))
             for name, values in self.signals.items()
         ]
-        return "\n".join((f"trace: {len(self)} rows{span}", *table(("signal", "unit", "least", "largest"), rows)))
+        return Summary(f"trace: {len(self)} rows{span}", ("signal", "unit", "least", "largest"), rows)
+
+    @staticmethod
+    def load(path: str | Path) -> Trace:
+        """Read a trace that a command wrote (.npz or .csv), as :func:`~pmsmtool.trace_file.read_trace` does."""
+        from pmsmtool.trace_file import read_trace
+
+        return read_trace(Path(path))
 
     def __len__(self) -> int:
         return len(self.t_s)

@@ -6,11 +6,15 @@ Before, a design took 12 331 letters on one line, a margin report 7 174, and a t
 
 from __future__ import annotations
 
+from html.parser import HTMLParser
+
 import numpy as np
 import pytest
 
 import pmsmtool
 from pmsmtool.design.design_file import Design
+from pmsmtool.design.lookup.design import LookupDesign
+from pmsmtool.design.loops.margins import MarginReport
 
 WIDTH, LINES = 120, 60
 
@@ -20,9 +24,32 @@ def design() -> Design:
     return pmsmtool.tune("interior-2k2")
 
 
-def shown(value: object) -> str:
+class Page(HTMLParser):
+    """Cells and lines of a page, in order; every tag that is opened is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        assert self.open[-1] in ("p", "th", "td")
+        self.words += data.split()
+
+
+def shown(value: pmsmtool.Trace | Design | pmsmtool.MachineFile | MarginReport | LookupDesign) -> str:
     text = repr(value)
     assert text == str(value)
+    assert Page(value._repr_html_()).words == text.split(), "a notebook shows what print does"
     assert max(map(len, text.splitlines())) <= WIDTH and len(text.splitlines()) <= LINES
     return " ".join(text.split())
 
@@ -54,6 +81,19 @@ def test_a_trace_shows_the_range_of_each_signal(rows: int) -> None:
     trace = pmsmtool.Trace(t_s, {"i_d_a": np.full(rows, -2.0), "i_q_a": 3.0 * t_s}, {"i_d_a": "A", "i_q_a": "A"})
     text = shown(trace)
     assert text.startswith(f"trace: {rows} rows") and ("i_d_a A -2 -2" in text) is (rows > 0)
+
+
+def test_a_table_shows_what_binds_and_what_lies_between(design: Design) -> None:
+    made = pmsmtool.lut(design, pmsmtool.LookupRequest(torque_points=9, y_points=9))
+    text = shown(made)
+    assert text.startswith("9 x 9 x 1 cells, float32; torque to 30.87 N m, speed to 4285.7 rpm limit cells current 6")
+    assert f"between nodes: torque within {made.error.torque_nm:.3g} N m" in text
+    assert any("brake chopper" in note for note in made.notes), "what a fault does beyond this speed"
+
+
+def test_letters_of_html_in_a_name_are_shown_as_they_are() -> None:
+    trace = pmsmtool.Trace(np.zeros(1), {"<b>": np.zeros(1)}, {"<b>": "A&V"})
+    assert "&lt;b&gt;</td><td>A&amp;V" in trace._repr_html_() and "<b> A&V" in shown(trace)
 
 
 def test_a_signal_that_is_not_there_names_the_nearest() -> None:

@@ -39,6 +39,7 @@ def test_round_trip(tmp_path, suffix, meta):
     trace = make_trace(meta=meta)
     write_trace(trace, path)
     assert_same(read_trace(path), trace)
+    assert_same(type(trace).load(str(path)), trace)
     assert [item.name for item in tmp_path.iterdir()] == [path.name]
 
 

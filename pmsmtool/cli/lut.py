@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from pmsmtool.cli.options import FILE, Quantity, examples, output_options, overspeed_option
-from pmsmtool.cli.output import Output, save_figure, table
+from pmsmtool.cli.output import Output, save_figure
 from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
@@ -70,21 +69,23 @@ def lut_command(
 
     Without bounds the largest grid that fits the drive's memory is used. Exit code 1 when given bounds do not fit.
     """
-    from pmsmtool.design.lookup.design import LookupRequest, design_table
+    from pmsmtool.commissioning.design_stages import lut
+    from pmsmtool.design.design_file import load_machine_or_design
+    from pmsmtool.design.lookup.design import LookupRequest
     from pmsmtool.design.lookup.file import table_csv, table_facts, table_npz
     from pmsmtool.design.lookup.loci import loci
     from pmsmtool.machine.flux_map_check import check_flux_map
     from pmsmtool.machine.iron_loss_map import load_iron_loss_map
     from pmsmtool.machine.profile import machine_path
 
-    file = Path(source) / "design.toml"
-    if not file.is_file():
-        file = machine_path(source)
-    machine, rated, margin = _limits(file, voltage_margin, overspeed_protection)
+    machine, design = load_machine_or_design(source)
     if iron_loss is None and machine.machine.iron_loss_map is not None:
-        iron_loss = file.parent / machine.machine.iron_loss_map
+        iron_loss = machine_path(source).parent / machine.machine.iron_loss_map
     loss_map = None if iron_loss is None else load_iron_loss_map(iron_loss)
-    made = design_table(machine, rated, LookupRequest(**asked), margin, loss_map)
+    made = lut(
+        design or machine, LookupRequest(**asked),
+        voltage_margin=voltage_margin, overspeed_protection=overspeed_protection, loss_map=loss_map,
+    )  # fmt: skip
     facts, lines = table_facts(made.table, made.stored, made.error), loci(made.table)
     write_file(path, table_npz(made.table, facts, lines))
     write_file(path.with_suffix(".csv"), table_csv(made.table))
@@ -95,40 +96,12 @@ def lut_command(
         save_figure(lookup_figure(made.table, lines), plot_path)
         written.append(plot_path)
     notes = list(made.notes)
-    if rated.reaction.note:
-        notes.append(rated.reaction.note)
-    out.result("lut", {"files": written, "notes": notes, **facts, **_counts(made)}, lambda: _lines(made))
+    out.result("lut", {"files": written, "notes": notes, **facts, **_counts(made)}, lambda: str(made).splitlines())
     for note in (*notes, *(check_flux_map(machine.flux_map).complaints if machine.flux_map else ())):
         out.note(note)
     out.note(f"wrote {', '.join(map(str, written))}")
 
 
-def _limits(file: Path, voltage_margin: float | None, protection: Protection | None) -> tuple[Any, Any, float]:
-    from pmsmtool.design.design_file import load_machine_or_design
-    from pmsmtool.design.ratings import ratings
-    from pmsmtool.design.tune_request import TuneRequest
-
-    machine, design = load_machine_or_design(file)
-    if voltage_margin is None:
-        voltage_margin = TuneRequest().voltage_margin if design is None else design["field_weakening.margin"]
-    stated: Any = protection or (None if design is None else design.request.get("overspeed_protection"))
-    return machine, ratings(machine, (1.0 - voltage_margin) * machine.inverter.V_max_v, stated), voltage_margin
-
-
 def _counts(made: LookupDesign) -> dict[str, Any]:
     names, counts = made.table.binding_counts()
     return {"cells": dict(zip(names, counts, strict=True)), "shape": made.table.i_d_a.shape}
-
-
-def _lines(made: LookupDesign) -> Iterator[str]:
-    lookup, error = made.table, made.error
-    shape = " x ".join(map(str, lookup.i_d_a.shape))
-    y_unit = "rpm" if lookup.axis_kind == "speed" else "Wb"
-    end = f"torque to {lookup.torque_nm[-1]:.4g} N m, {lookup.axis_kind} to {lookup.y[-1]:.5g} {y_unit}"
-    yield f"{shape} cells, {made.stored}; {end}"
-    yield (
-        f"between nodes: torque within {error.torque_nm:.3g} N m, voltage at most {error.voltage_v:.3g} V "
-        f"and current at most {error.current_a:.3g} A beyond their limits"
-    )
-    yield ""
-    yield from table(("limit", "cells"), zip(*lookup.binding_counts(), strict=True))

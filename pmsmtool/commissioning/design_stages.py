@@ -6,22 +6,25 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import Any, cast
 
 from pmsmtool.commissioning.held_design import Designed, why_not_judged
-from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design
+from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design, load_machine_or_design
 from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.design.lookup.design import LookupDesign, LookupRequest, design_table
 from pmsmtool.design.lookup.file import lut_values, table_csv, table_facts, table_npz
 from pmsmtool.design.lookup.loci import loci
 from pmsmtool.design.loops.margins import JUDGED_PERCENTILE, MarginRequest, Spread, margin_report
 from pmsmtool.design.loops.sampled_loop import LoopMargins
-from pmsmtool.design.ratings import ratings_of
+from pmsmtool.design.ratings import ratings, ratings_of
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import NotAvailable
-from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.flux_map import FluxMap
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.uncontrolled_generation import Protection
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage
 
@@ -78,6 +81,49 @@ def _loop_criteria(name: str, loop: LoopMargins, request: TuneRequest) -> list[A
 def _at_least(what: str, value: float, least: float, unit: str, stable: bool) -> Acceptance:
     measured = f"{value:.1f} {unit}" if stable else "unstable"
     return Acceptance(what, measured, f">= {least:g} {unit}", stable and value >= least)
+
+
+def lut(
+    source: str | Path | Design | MachineFile,
+    request: LookupRequest | None = None,
+    *,
+    voltage_margin: float | None = None,
+    overspeed_protection: Protection | None = None,
+    loss_map: FluxMap | None = None,
+) -> LookupDesign:
+    """Make the current references of a machine, as the command of the same name does.
+
+    Parameters
+    ----------
+    source : str, Path, Design or MachineFile
+        Machine and inverter; text names a file, a run directory or a shipped profile.
+    request : LookupRequest, optional
+        What is asked; the defaults of the class.
+    voltage_margin, overspeed_protection
+        As in a :class:`~pmsmtool.design.tune_request.TuneRequest`; those of the design, or the defaults.
+    loss_map : FluxMap, optional
+        Iron loss (``OperatingMachine.loss_map``).
+
+    Raises
+    ------
+    ConfigError, DesignInfeasible
+        What is wrong with the source; as :func:`~pmsmtool.design.lookup.design.design_table`.
+
+    Examples
+    --------
+    >>> import pmsmtool
+    >>> made = pmsmtool.lut("jercic-2017", pmsmtool.LookupRequest(torque_points=9, y_points=5))
+    >>> made.table.i_d_a.shape
+    (9, 5, 1)
+    """
+    machine, design = load_machine_or_design(source)
+    margin = voltage_margin
+    if margin is None:
+        margin = TuneRequest().voltage_margin if design is None else design["field_weakening.margin"]
+    stated = overspeed_protection or (None if design is None else design.request.get("overspeed_protection"))
+    rated = ratings(machine, (1.0 - margin) * machine.inverter.V_max_v, cast("Protection | None", stated))
+    made = design_table(machine, rated, request or LookupRequest(), margin, loss_map)
+    return replace(made, notes=(*made.notes, *filter(None, [rated.reaction.note])))
 
 
 def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:

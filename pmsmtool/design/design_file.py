@@ -17,9 +17,10 @@ from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
 from pmsmtool.machine.key import Key, check_table, did_you_mean
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_from_tables, machine_tables
+from pmsmtool.machine.profile import machine_path
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
-from pmsmtool.plain_text import table
+from pmsmtool.plain_text import Summarised, Summary
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
 
@@ -49,8 +50,8 @@ class DesignValue:
     loop: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class Design:
+@dataclass(frozen=True, slots=True, repr=False)
+class Design(Summarised):
     """A complete set of drive parameters with their reasons.
 
     Attributes
@@ -85,13 +86,12 @@ class Design:
             raise KeyError(f"a design has no {name!r}{did_you_mean(name, list(self.values))}")
         return self.values[name].value
 
-    def __repr__(self) -> str:
+    def summary(self) -> Summary:
+        """Return the gains, and what their loops achieve."""
         gains = [(name, f"{v.value:.6g}", BY_NAME[name].unit, v.method) for name, v in self.values.items() if v.loop]
-        lines = [
-            *table(("gain", "value", "unit", "method"), gains),
-            *(f"{k}: {achieved(x)}" for k, x in self.loops.items()),
-        ]
-        return "\n".join((f"design of {self.name}: {len(self.values)} values, of which", *lines, *self.notes))
+        head = f"design of {self.name}: {len(self.values)} values, of which"
+        loops = [f"{k}: {achieved(x)}" for k, x in self.loops.items()]
+        return Summary(head, ("gain", "value", "unit", "method"), gains, [*loops, *self.notes])
 
     @property
     def name(self) -> str:
@@ -165,8 +165,27 @@ def load_design(path: str | Path) -> Design:
 
 
 @next_step(NEXT_STEP)
-def load_machine_or_design(path: Path) -> tuple[MachineFile, Design | None]:
-    """Read a machine file or a design, told apart by their schema; a design brings its own machine."""
+def load_machine_or_design(source: str | Path | Design | MachineFile) -> tuple[MachineFile, Design | None]:
+    """Return a machine, and its design where the source is one.
+
+    Parameters
+    ----------
+    source : str, Path, Design or MachineFile
+        File, told apart by its schema, run directory, of which the design comes first, or profile name; or what such a
+        file holds.
+
+    Raises
+    ------
+    ConfigError
+        There is no such thing, or what is wrong with it.
+    """
+    if isinstance(source, Design):
+        return source.machine, source
+    if isinstance(source, MachineFile):
+        return source, None
+    path = Path(source) / "design.toml"
+    if not path.is_file():
+        path = machine_path(source)
     text = ""
     with contextlib.suppress(ConfigError):  # the reader below says what is wrong
         text = read_text(path)

@@ -30,7 +30,7 @@ from pmsmtool.machine.parameters import (
 )
 from pmsmtool.machine.profile import NAMED, machine_path
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS, resolved_simulation
-from pmsmtool.plain_text import table
+from pmsmtool.plain_text import Summarised, Summary
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.toml_text import toml_lines, toml_text
 
@@ -43,8 +43,8 @@ _HASHED: tuple[str, ...] = ("machine", "inverter", "std", "systematic", "encoder
 Record = Mapping[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class MachineFile:
+@dataclass(frozen=True, slots=True, repr=False)
+class MachineFile(Summarised):
     """What a machine file says.
 
     Attributes
@@ -78,7 +78,8 @@ class MachineFile:
     simulation: Mapping[str, Value] = field(default_factory=dict)
     flux_map: FluxMap | None = None
 
-    def __repr__(self) -> str:
+    def summary(self) -> Summary:
+        """Return the values of machine and inverter."""
         given = {**asdict(self.machine), **asdict(self.inverter)}
         rows = [
             (
@@ -89,7 +90,7 @@ class MachineFile:
             for key, value in given.items()
             if isinstance(value, (str, int, float)) and not isinstance(value, bool)
         ]
-        return "\n".join((f"machine file {self.name}", *table(("key", "value", "std"), rows)))
+        return Summary(f"machine file {self.name}", ("key", "value", "std"), rows)
 
     def simulation_settings(self) -> dict[str, Value]:
         """Return every ``[simulation]`` key with the value that holds, defaults and fall-backs filled in."""

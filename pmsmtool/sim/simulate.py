@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.params.parameter_set import ParameterSet, read_parameter_set
 from pmsmtool.sim import closed_loop
 from pmsmtool.sim.closed_loop import drive_values
@@ -63,16 +62,10 @@ def find_drive(source: str | Path | Design | MachineFile, params: Path | None = 
     DesignInfeasible
         No design for this machine.
     """
-    from pmsmtool.design.design_file import Design, load_machine_or_design
+    from pmsmtool.design.design_file import load_machine_or_design
     from pmsmtool.design.tune import tune
 
-    if isinstance(source, Design):
-        machine, design = source.machine, source
-    elif isinstance(source, MachineFile):
-        machine, design = source, None
-    else:
-        designed = Path(source) / "design.toml"
-        machine, design = load_machine_or_design(designed if designed.is_file() else machine_path(source))
+    machine, design = load_machine_or_design(source)
     if design is None:
         made = tune(machine)
         found = SimulatedDrive(machine, made.parameter_set(), "designed by the rules of `tune`", made.notes)

@@ -37,6 +37,7 @@ from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.saturation_table import NODES_D, NODES_Q
 from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS, SATURATION_VALUES
+from pmsmtool.plain_text import Summarised, Summary
 
 FIRST_TORQUES, FIRST_SPEEDS = 17, 13
 """Nodes of the axes that refinement starts from."""
@@ -104,8 +105,8 @@ class LookupRequest:
             raise ConfigError("the request cannot be used", where="lut", violations=wrong)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LookupDesign:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LookupDesign(Summarised):
     """A table with what must be known of it.
 
     Attributes
@@ -128,6 +129,19 @@ class LookupDesign:
     notes: tuple[str, ...]
     torque_bound: float = math.inf
     voltage_bound: float = math.inf
+
+    def summary(self) -> Summary:
+        """Return how large the table is, what binds in its cells, and what interpolation does between them."""
+        lookup, error = self.table, self.error
+        shape = " x ".join(map(str, lookup.i_d_a.shape))
+        y_unit = "rpm" if lookup.axis_kind == "speed" else "Wb"
+        end = f"torque to {lookup.torque_nm[-1]:.4g} N m, {lookup.axis_kind} to {lookup.y[-1]:.5g} {y_unit}"
+        between = (
+            f"between nodes: torque within {error.torque_nm:.3g} N m, voltage at most {error.voltage_v:.3g} V "
+            f"and current at most {error.current_a:.3g} A beyond their limits"
+        )
+        cells = list(zip(*lookup.binding_counts(), strict=True))
+        return Summary(f"{shape} cells, {self.stored}; {end}", ("limit", "cells"), cells, (between,))
 
 
 def design_table(

@@ -35,7 +35,7 @@ from pmsmtool.design.ratings import ratings_of
 from pmsmtool.design.tolerance import Samples, ToleranceBox
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
-from pmsmtool.plain_text import table
+from pmsmtool.plain_text import Summarised, Summary
 
 BLOCK = 2048
 """Random samples of one block (40 ms of work); fixed, because it decides the numbers."""
@@ -144,8 +144,8 @@ class CellRisk:
     current: float
 
 
-@dataclass(frozen=True, slots=True)
-class MarginReport:
+@dataclass(frozen=True, slots=True, repr=False)
+class MarginReport(Summarised):
     """Margins of a design over its box.
 
     Attributes
@@ -170,7 +170,8 @@ class MarginReport:
     samples: int
     notes: tuple[str, ...]
 
-    def __repr__(self) -> str:
+    def summary(self) -> Summary:
+        """Return the margins at the worst corner."""
         rows = [
             (
                 s.name,
@@ -181,8 +182,8 @@ class MarginReport:
             )
             for s in (*self.loops, *self.headroom)
         ]
-        lines = table(("margin", "unit", "nominal", "worst corner", "asked", "ok"), rows)
-        return "\n".join((f"margins over {self.corners} corners and {self.samples} samples, ok: {self.ok}", *lines))
+        head = f"margins over {self.corners} corners and {self.samples} samples, ok: {self.ok}"
+        return Summary(head, ("margin", "unit", "nominal", "worst corner", "asked", "ok"), rows)
 
     @property
     def ok(self) -> bool:
