@@ -44,6 +44,7 @@ from pmsmtool.identification.sampling import resistance_as_sampled
 from pmsmtool.identification.wiring import Finding, supply_under_load
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
+from pmsmtool.plain_text import counted
 from pmsmtool.trace import Trace
 
 MOTION_STD = 0.2
@@ -323,7 +324,7 @@ def resistance_of(
     result = estimate_resistance(levels, noise, tolerance=tolerance, copper=copper, plateau_v=plateau_v)
     if not left_out:
         return result
-    note = f"{left_out} levels left out: shaft or voltage moved during them"
+    note = f"{counted(left_out, 'level')} left out: shaft or voltage moved then"
     fallback = "; ".join(part for part in (result.R_s.fallback, note) if part)
     return replace(result, R_s=replace(result.R_s, fallback=fallback))
 
