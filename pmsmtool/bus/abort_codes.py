@@ -50,6 +50,9 @@ TRANSPORT_CODES = frozenset(
 BLOCK_REFUSED_CODES = frozenset({AbortCode.COMMAND, AbortCode.ACCESS})
 """What servers without block transfer answer to its initiate; other codes are about the object."""
 
+BUSY_CODES = frozenset({AbortCode.RESOURCE, AbortCode.LOCAL_CONTROL, AbortCode.DEVICE_STATE})
+"""What drives answer while they store, start, or are asked too much: the same request may pass a moment later."""
+
 _MANUAL = "look the object up in the drive's manual or EDS; `pmsmtool info` names drive and firmware"
 _LIKELY: dict[int, tuple[str, str]] = {
     AbortCode.NO_OBJECT: ("the drive's firmware does not have this object", "compare `pmsmtool info` with the map"),
@@ -58,6 +61,7 @@ _LIKELY: dict[int, tuple[str, str]] = {
     AbortCode.VALUE_LOW: ("the value is below the drive's limit", "`pmsmtool param help NAME` shows the limits"),
     AbortCode.VALUE: ("the value is outside what the drive accepts", "`pmsmtool param help NAME` shows the limits"),
     AbortCode.DEVICE_STATE: ("the drive is enabled or in fault", "`pmsmtool stop`, then `pmsmtool fault show`"),
+    AbortCode.RESOURCE: ("the drive is busy, it may store or start", "run the command again in a few seconds"),
     AbortCode.LOCAL_CONTROL: ("the drive is under local control", "release the panel or the vendor's software"),
     AbortCode.READ_ONLY: ("the object only reports", _MANUAL),
     AbortCode.WRITE_ONLY: ("the object can only be written", _MANUAL),

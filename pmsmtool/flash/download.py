@@ -14,15 +14,17 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, auto
 
+from pmsmtool.bus.abort_codes import BUSY_CODES
 from pmsmtool.bus.nmt import TOOL_NODE
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.drive import objects
-from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.drive_node import STORE_POLL_S, STORE_TIMEOUT_S, DriveNode
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.parameters import Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import (
+    DriveFault,
     DriveTimeout,
     Interrupted,
     NotAvailable,
@@ -127,6 +129,7 @@ class Download:
         self._old_marks: dict[str, bytes] = {}
         self._was_stored = False
         self._crc_before: int | None = None
+        self._stored_before: int | None = None
         self._rolled_back: State = "restored"
         self._holds = ""
 
@@ -206,6 +209,7 @@ class Download:
         self._old_marks = self._read_marks()
         self._was_stored = self._parameters.is_stored()
         self._crc_before = self._parameters.crc_active if self.node.map.staging else None
+        self._stored_before = self._stored_crc()
         same_marks = self._old_marks.get("design_id") == self._wanted_marks.get("design_id")
         return bool(self.plan.changes) or not same_marks or (store and not self._was_stored)
 
@@ -412,16 +416,37 @@ class Download:
         if self.phase is Phase.ACTIVE and self._was_stored:
             self.node.reset()
         else:
-            whole = isinstance(self._parameters, WholeDrive)  # compares first: a PDO half written shows
-            due = self.plan.entries if whole else self.plan.changes
-            self._parameters.replace({change.name: change.old for change in due})
-            self._write_marks(self._old_marks)
+            self._until_stored(self._write_old)
             if self.phase is Phase.STORING:
-                # The memory may hold the new set already; the set that acted before is stored over it.
-                self.node.store()
+                # The memory may hold the new set already; the set that acted before is stored over it. Where the drive
+                # refuses that, it is seen after the reset whether it refused the new set, too.
+                with contextlib.suppress(SdoAbort):
+                    self._until_stored(self.node.store)
                 self.node.reset()
-        stored = self._was_stored or self.phase is Phase.STORING
+        stored = self._was_stored or self._stored_crc() != self._stored_before
         self._verify(old, self._old_marks, self._crc_before, stored=stored)
+
+    def _write_old(self) -> None:
+        whole = isinstance(self._parameters, WholeDrive)  # compares first: a PDO half written shows
+        due = self.plan.entries if whole else self.plan.changes
+        self._parameters.replace({change.name: change.old for change in due})
+        self._write_marks(self._old_marks)
+
+    def _until_stored(self, work: Callable[[], None]) -> None:
+        """Do something that a drive refuses while it still stores, again until it has finished."""
+        clock = self.node.connection.clock
+        until = clock.now() + (STORE_TIMEOUT_S if self.phase is Phase.STORING else 0.0)
+        while True:
+            try:
+                return work()
+            except DriveFault as fault:
+                busy = not isinstance(fault, SdoAbort) or fault.code in BUSY_CODES
+                if not busy or clock.now() >= until:
+                    raise
+                self.node.connection.wait(STORE_POLL_S)
+
+    def _stored_crc(self) -> int | None:
+        return self._parameters.crc_stored if self.node.map.staging else None
 
     def _left_behind(self, second: BaseException) -> str:
         holds = (

@@ -25,6 +25,7 @@ from pmsmtool.errors import (
 from pmsmtool.flash.journal import MARKS, JournalFolder
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.sim.line import Frame
+from pmsmtool.sim.node.dictionary import Refused
 from tests.flash.rig import SMALL, Rig, attach, open_rig, with_tables
 
 
@@ -210,6 +211,55 @@ def test_refused_store_brings_the_old_set_back(tmp_path: Path) -> None:
     with pytest.raises(DriveFault, match="holds exactly the old set again"):
         rig.download(SMALL)
     assert rig.image() == before
+
+
+@pytest.mark.parametrize("saved_before", [False, True])
+@pytest.mark.parametrize("lies", [False, True])
+def test_a_drive_that_never_stores_holds_the_old_set(rig: Rig, saved_before: bool, lies: bool) -> None:
+    """It refuses every store, or confirms it and does nothing: after the reset the old set acts, and that is said."""
+    if saved_before:
+        rig.download(ParameterSet({"motor.R_s_ohm": 0.5}))
+
+    def store(data: bytes) -> bool | None:
+        if lies:
+            return None
+        raise Refused(0x06060000)
+
+    def spoil() -> None:
+        assert rig.bench.node.session is not None
+        rig.bench.node.session.dictionary["store.all"].sink = store
+        build = rig.bench.node.start
+        rig.bench.node.start = lambda: (spoil(), build())  # type: ignore[method-assign, assignment, func-returns-value]
+
+    before, crcs = rig.image(), rig.crcs()
+    spoil()
+    with pytest.raises(PmsmtoolError, match="holds exactly the old set again") as caught:
+        rig.download(SMALL)
+    assert isinstance(caught.value, VerifyMismatch if lies else DriveFault)
+    assert rig.image() == before and rig.crcs() == crcs
+    journal = rig.folder.last()
+    assert journal is not None and journal.state == "restored"
+
+
+FOREIGN = b"\x2b\x40\x60" + bytes(5)
+"""A write of the controlword that is not ours."""
+
+
+def test_another_master_while_the_drive_stores_brings_the_old_set_back(tmp_path: Path) -> None:
+    """The drive refuses every write until it has stored; the roll-back waits for that."""
+    rig = open_rig(tmp_path, faults="[store]\nfactor = 20.0\n")
+    before = rig.image()
+
+    def say(text: str) -> None:
+        if text == "storing":
+            rig.bench.line.clock.after(0.2, lambda: rig.node.supervision._on_request(0x601, FOREIGN, 0.0))
+
+    plan = rig.plan(SMALL)
+    job = rig.job(plan, {})
+    job._say = say
+    with pytest.raises(SecondMaster, match="holds exactly the old set again"):
+        job.run()
+    assert rig.image() == before and len(set(rig.crcs())) == 1
 
 
 def test_slow_store_is_waited_for_and_sent_once(tmp_path: Path) -> None:
