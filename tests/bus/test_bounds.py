@@ -13,8 +13,9 @@ import pytest
 from pmsmtool.bus.connect import Connection, connect
 from pmsmtool.bus.sdo import Mode, SdoChannel
 from pmsmtool.bus.sdo_transfer import LARGEST_UNKNOWN, OBJECT_LIMIT_S
+from pmsmtool.cia402 import State
 from pmsmtool.drive.drive_node import LONGEST_NAME, DriveNode
-from pmsmtool.drive.stop import quick_stop
+from pmsmtool.drive.stop import BUSY_S, quick_stop
 from pmsmtool.errors import BusError, DriveTimeout, SdoAbort, StopNotConfirmed
 from tests.bus.scripted import NODE, ScriptedBus, ScriptedSlave
 
@@ -243,3 +244,25 @@ def test_a_store_under_way_is_waited_for_and_no_longer(code: int | None) -> None
     node.sdo.slow_objects.clear()
     node.wait_for_store()
     assert 1.5 < bus.clock.now() < 3.0
+
+
+def test_a_stop_of_a_busy_drive_is_asked_for_until_it_answers() -> None:
+    """Drives refuse with 0x08000022 while they store or start: 2.5 s here, 3 s are waited for."""
+    bus: ScriptedBus
+
+    def answers(request: bytes) -> list[bytes]:
+        head = request[1:4]
+        if bus.clock.now() < busy_s:
+            return [b"\x80" + head + (0x08000022).to_bytes(4, "little")]
+        return [b"\x4b" + head + b"\x40\x02\0\0" if request[0] == 0x40 else b"\x60" + head + bytes(4)]
+
+    for busy_s, confirmed in ((2.5, True), (60.0, False)):
+        bus, _ = opened(answers)
+        node = DriveNode(Connection(bus), NODE)
+        if confirmed:
+            assert quick_stop(node) is State.SWITCH_ON_DISABLED
+            assert busy_s <= bus.clock.now() < busy_s + 0.5
+        else:
+            with pytest.raises(StopNotConfirmed, match="device state"):
+                quick_stop(node)
+            assert bus.clock.now() < BUSY_S + 0.5
