@@ -58,14 +58,13 @@ class Mailbox:
         """Return the next frame's data, or None after ``timeout_s`` on the bus clock."""
         return self._connection.wait_for(self._frames, timeout_s)
 
-    def clear(self) -> int:
-        """Throw away what arrived; return how many frames that were."""
+    def clear(self) -> list[bytes]:
+        """Take out all that arrived, and return it."""
         self._connection.collect()
-        count = 0
+        taken = []
         while not self._frames.empty():
-            self._frames.get_nowait()
-            count += 1
-        return count
+            taken.append(self._frames.get_nowait())
+        return taken
 
     def close(self) -> None:
         """Stop listening."""
@@ -339,7 +338,8 @@ class Connection:
             return
         self.frames_received += 1
         cob_id = message.arbitration_id
-        if message.is_extended_id or message.is_remote_frame or not message.is_rx or len(message.data) > 8:
+        odd = message.is_extended_id or message.is_remote_frame or message.is_fd or len(message.data) > 8
+        if odd or not message.is_rx:  # CANopen has classic data frames with 11-bit identifiers alone
             return
         self.heard.add(cob_id)
         callbacks = self._subscribers.get(cob_id)

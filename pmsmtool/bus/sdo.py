@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -54,6 +55,15 @@ BARRIER = ((0x1000, 0), (0x1018, 1), (0x1018, 2), (0x1018, 0))
 """Objects every node answers for, read in turn: what arrives before the answer belongs to the past."""
 SLOWEST_ANSWER_S = 1.0
 """The time-out grows to this with a node that answers late."""
+NAMING = (2, 3, 4)
+"""Server command specifiers of the answers that name their object: upload, download, abort."""
+REMEMBERED = 4
+"""Answers kept to compare late ones with: a second node may be slower by a few round trips."""
+LATEST_S = 2.0
+"""After a lost answer, what comes within this time may be that one."""
+WRONG_ANSWERS = "the drive's SDO server answers wrongly, or two nodes share this node id"
+GIVEN_UP = "the node is busy, or frames get lost on the bus"
+"""Causes of a transfer that timed out although the node sends."""
 
 
 class OutOfTime(DriveTimeout):
@@ -80,6 +90,8 @@ class SdoChannel:
         None until a block transfer was tried.
     retries, discarded : int
         Sums over the life of the channel.
+    contradiction : str
+        The last answer that came a second time and said something else: two nodes answer. Empty where none did.
     active_s : float
         When (s, bus clock) the caller's thread last was at work in a transfer.
     """
@@ -99,6 +111,9 @@ class SdoChannel:
         self.block_supported: bool | None = None
         self.retries = 0
         self.discarded = 0
+        self.contradiction = ""
+        self._answers: deque[bytes] = deque(maxlen=REMEMBERED)
+        self._compared_from_s = -math.inf
         self._check = check
         self.active_s = -math.inf
         self._over_s = math.inf
@@ -245,31 +260,54 @@ class SdoChannel:
         deadline = now + attempt.timeout_s
         if self._unanswered_s is None:
             self._unanswered_s = now
+        instead = ""
         while True:
             frame = self.receive(max(0.0, deadline - now))
             if frame is not None and frame[0] == 0x80:
                 self.raise_if_abort_of(attempt, frame)
             elif frame is not None and accept(frame):
                 self._unanswered_s = None
+                self._remember(frame)
                 return frame
             now = self.connection.clock.now()
             if frame is None or now > deadline:  # whoever floods the channel does not prolong the wait
-                raise TransferLost(f"no answer to {what} within {attempt.timeout_s:.2g} s")
+                silence = f"no answer to {what} within {attempt.timeout_s:.2g} s"
+                raise TransferLost(f"{silence}{instead}", likely=WRONG_ANSWERS if instead else "")
             attempt.discarded += 1
+            self._compare(frame)
+            instead = f", but {_named(frame)}"
 
     def raise_if_abort_of(self, attempt: Attempt, frame: bytes) -> None:
         """Raise when an abort frame belongs to this transfer; a node that names no object means us."""
         if not attempt.owns(frame) and MULTIPLEXOR.unpack_from(frame)[1:] != (0, 0):
             return
         self._unanswered_s = None
+        self._remember(frame)
         code = int.from_bytes(frame[4:8], "little")
         if code in TRANSPORT_CODES:
-            raise TransferLost(f"node aborted: {abort_text(code)} ({code:#010x})", code, abort_owed=False)
+            raise TransferLost(
+                f"node aborted: {abort_text(code)} ({code:#010x})", code, abort_owed=False, likely=GIVEN_UP
+            )
         likely, hint = abort_advice(code)
         raise SdoAbort(
             code, attempt.index, attempt.sub, f"node refused: {abort_text(code)} ({code:#010x})",
             where=self._where(attempt), likely=likely, hint=hint,
         )  # fmt: skip
+
+    def _remember(self, answer: bytes) -> None:
+        if self.connection.clock.now() > self._compared_from_s:
+            self._answers.append(answer)
+
+    def _forget_answers(self) -> None:
+        """After a lost answer: what still comes for a while may be late, and contradicts nothing."""
+        self._answers.clear()
+        self._compared_from_s = self.connection.clock.now() + LATEST_S
+
+    def _compare(self, frame: bytes) -> None:
+        """Note an answer to a request that was answered before, and otherwise."""
+        alike = [answer for answer in self._answers if answer[1:4] == frame[1:4]]
+        if frame[0] >> 5 in NAMING and alike and frame not in alike and not _is_of_transport(frame):
+            self.contradiction = f"{_named(frame)} came twice, as {alike[-1].hex(' ')} and as {frame.hex(' ')}"
 
     def check_announced(self, attempt: Attempt, announced: int | None) -> None:
         """Compare the announced with the expected length before anything is transferred."""
@@ -317,6 +355,7 @@ class SdoChannel:
                 return once(), count
             except TransferLost as lost:
                 self._unsettled = True
+                self._forget_answers()
                 attempt.notes.append(f"try {count}: {lost.what}")
                 self._leave(attempt, lost)
                 if recover is not None and attempt.mode is Mode.EXPEDITED and recover():
@@ -440,18 +479,22 @@ class SdoChannel:
                 hint="let the callback only take notes; this is a bug worth reporting",
             )
         with self._lock:
-            attempt.discarded += self._mailbox.clear()
+            for frame in self._mailbox.clear():
+                attempt.discarded += 1
+                self._compare(frame.ljust(8, b"\0"))
             self.raise_if_pointless()
             try:
                 yield attempt
             except OutOfTime:
                 self._unsettled = True
+                self._forget_answers()
                 self._abort_quietly(attempt)
                 raise
             except (SdoAbort, DriveTimeout):
                 raise
             except BaseException:
                 self._unsettled = True
+                self._forget_answers()
                 # Interrupted, cancelled or supervised away: the node must not stay inside a transfer.
                 self._abort_quietly(attempt)
                 raise
@@ -481,6 +524,8 @@ class SdoChannel:
 
     def _result(self, attempt: Attempt, data: bytes, tries: int) -> Transfer:
         self.retries += tries - 1
+        if tries > 1:  # the answer to an earlier try may still come
+            self._forget_answers()
         return Transfer(data, attempt.mode, tries, attempt.retransmitted, attempt.discarded, tuple(attempt.notes))
 
     def _where(self, attempt: Attempt) -> str:
@@ -494,9 +539,23 @@ class SdoChannel:
         what = lost.what if tries == 1 else f"{lost.what} ({told})"
         if lost.code == AbortCode.TIMED_OUT:
             likely, hint = self.connection.explain_silence(self.node)
+            if lost.likely:
+                likely, hint = lost.likely, f"`pmsmtool doctor`, then `pmsmtool info -n {self.node}`"
             return DriveTimeout(what, where=where, likely=likely, hint=hint)
         likely, hint = abort_advice(lost.code)
         return SdoAbort(lost.code, attempt.index, attempt.sub, what, where=where, likely=likely, hint=hint)
+
+
+def _named(frame: bytes) -> str:
+    """Say what a frame is that was not the answer awaited."""
+    if frame[0] >> 5 not in NAMING:
+        return "a segment with the wrong toggle bit, or a late one"
+    _, index, sub = MULTIPLEXOR.unpack_from(frame)
+    return f"an answer for 0x{index:04X}:{sub:02X}"
+
+
+def _is_of_transport(frame: bytes) -> bool:
+    return frame[0] == 0x80 and int.from_bytes(frame[4:8], "little") in TRANSPORT_CODES
 
 
 def _expedited(index: int, sub: int, data: bytes) -> bytes:

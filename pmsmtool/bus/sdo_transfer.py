@@ -115,13 +115,18 @@ class TransferLost(Exception):
         Abort code that describes the failure.
     abort_owed : bool
         Whether the node still believes in the transfer and must be told.
+    likely : str
+        The cause where the frames that came show it.
     """
 
-    def __init__(self, what: str, code: int = AbortCode.TIMED_OUT, *, abort_owed: bool = True) -> None:
+    def __init__(
+        self, what: str, code: int = AbortCode.TIMED_OUT, *, abort_owed: bool = True, likely: str = ""
+    ) -> None:
         super().__init__(what)
         self.what = what
         self.code = code
         self.abort_owed = abort_owed
+        self.likely = likely
 
 
 class BlockRefused(Exception):

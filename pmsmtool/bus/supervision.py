@@ -175,7 +175,7 @@ class Supervision:
             raise NodeReset(
                 "the node was reset in the middle of the work: values not stored are lost",
                 where=f"node {self.node}",
-                likely="its supply dipped, its watchdog fired, or another master reset it",
+                likely="its supply dipped, its watchdog fired, another master reset it, or a second node has its id",
                 hint="check the supply, then run the command again",
             )
         if self.foreign_requests > self._foreign_seen and self.stop_at_other_master:

@@ -25,7 +25,7 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
-from pmsmtool.errors import DriveFault, DriveTimeout, SdoAbort
+from pmsmtool.errors import BusError, DriveFault, DriveTimeout, SdoAbort
 from pmsmtool.plain_text import one_line
 
 STATE_TIMEOUT_S = 2.0
@@ -125,6 +125,11 @@ class DriveNode:
         """Read identity object and names; also the producer heartbeat time; supervision begins here.
 
         A number the node does not have is 0: only the vendor is mandatory (CiA 301, object 0x1018).
+
+        Raises
+        ------
+        BusError
+            Two nodes answer.
         """
         self.supervision.begin()
         vendor, product, serial = vendor_product_serial(self.sdo, self.map)
@@ -135,7 +140,18 @@ class DriveNode:
         with contextlib.suppress(SdoAbort):
             self.supervision.heartbeat_period_s = self.get(objects.PRODUCER_HEARTBEAT_MS) / 1000.0 or None
         doubt = self._doubt(vendor, product, name)
+        self._refuse_two_nodes()
         return Identity(self.node, vendor, product, revision, serial, name, hardware, software, doubt)
+
+    def _refuse_two_nodes(self) -> None:
+        if self.sdo.contradiction:
+            self.supervision.check()  # answers to another master's requests come here, too
+            raise BusError(
+                f"two nodes answer on node id {self.node}: {self.sdo.contradiction}",
+                where=f"node {self.node}",
+                likely="two drives have this node id",
+                hint="connect one drive alone, and give it another node id (its switches, or `pmsmtool lss`)",
+            )
 
     def _doubt(self, vendor: int, product: int, name: str) -> str:
         """Say why a drive of a shared vendor number is not taken for its map's; empty when it is."""
