@@ -161,6 +161,68 @@ def test_second_master_is_refused_before_writing(rig: Rig) -> None:
     assert not rig.folder.path.exists()
 
 
+def supervised(node: int, time_ms: int = 500) -> bytes:
+    """Return an entry of 0x1016."""
+    return (node << 16 | time_ms).to_bytes(4, "little")
+
+
+@pytest.mark.parametrize(
+    ("entry", "beating", "refused"),
+    [
+        (supervised(20), 20, True),
+        (supervised(127), 127, True),
+        (supervised(20), 21, False),
+        (supervised(20, 0), 20, False),
+        (supervised(0), 0, False),
+        (supervised(128), 128, False),
+    ],
+)
+def test_the_heartbeat_of_a_master_that_the_drive_supervises_is_heard(
+    rig: Rig, entry: bytes, beating: int, refused: bool
+) -> None:
+    assert rig.bench.node.session is not None
+    rig.bench.node.session.dictionary.find(0x1016, 1).value = entry
+    plan = rig.plan(SMALL)
+    rig.bench.line.clock.every(0.1, lambda: rig.bench.line.deliver(None, Frame(0x700 + beating, b"\x05")))
+    if refused:
+        with pytest.raises(SecondMaster, match=f"heartbeat of node {beating}, a master this drive supervises"):
+            rig.job(plan, {}).run()
+        assert not rig.folder.path.exists()
+        return
+    assert rig.job(plan, {}).run().written == 4
+
+
+@pytest.mark.parametrize("answer", [b"\x43\x00\x10\x00\x92\x01\x02\x00", b"\x80\x00\x10\x00\x00\x00\x02\x06"])
+def test_a_drive_that_the_drive_supervises_is_no_master(rig: Rig, answer: bytes) -> None:
+    """Drives of one machine supervise each other: who answers for an object, or refuses it, is a device."""
+    rig.node.sdo.download(0x1016, 1, supervised(20))
+    plan, line, asked = rig.plan(SMALL), rig.bench.line, list[bytes]()
+
+    def hear(can_id: int, data: bytes, flags: int) -> None:
+        if can_id == 0x614:
+            asked.append(data)
+            line.clock.after(1e-3, lambda: line.deliver(None, Frame(0x594, answer)))
+
+    receive = rig.bench.node.receive
+    rig.bench.node.receive = lambda *frame: (hear(*frame), receive(*frame))[1]  # type: ignore[method-assign, func-returns-value]
+    line.clock.every(0.1, lambda: line.deliver(None, Frame(0x714, b"\x05")))
+    assert rig.job(plan, {}).run().written == 4
+    assert asked == [b"\x40\x00\x10\x00" + bytes(4)]
+
+
+def test_a_download_that_had_reached_its_end_closes_its_journal(rig: Rig) -> None:
+    """Killed between the last read and the note: nothing is due, and the journal is finished."""
+    rig.download(SMALL)
+    for state in ("open", "restored"):
+        journal = rig.folder.last()
+        assert journal is not None
+        rig.folder.close(journal, "open" if state == "open" else "restored")
+        outcome = rig.download(SMALL)
+        assert (outcome.written, outcome.stored, outcome.starts, outcome.retries) == (0, True, 1, 0)
+        after = rig.folder.last()
+        assert after is not None and after.state == ("done" if state == "open" else "restored")
+
+
 def test_unknown_layout_is_refused(rig: Rig) -> None:
     session = rig.bench.node.session
     assert session is not None

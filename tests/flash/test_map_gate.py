@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: MIT
+"""Which map a drive is moved, read and written through: the one that names it, and the same as the last time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.port import Identity
+from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
+from pmsmtool.drive_maps.drive_map_file import map_hash
+from pmsmtool.drive_maps.shipped_maps import load_family
+from pmsmtool.errors import ConfigError, SafetyRefusal
+from pmsmtool.flash.journal import JournalFolder
+from pmsmtool.flash.map_gate import (
+    SHOWN,
+    check_map,
+    check_motion,
+    contradictions,
+    forget_map,
+    memory_of,
+    other_drive,
+    remember_map,
+    unknown_firmware,
+)
+from tests.bus.scripted import NODE
+from tests.drive.table_drive import opened
+
+EPOS4, GENERIC, OURS = load_family("epos4"), load_family("cia402"), reference_map()
+COPIED = replace(GENERIC, vendor=7, product=8)
+"""A copy of the generic map whose owner wrote his drive's identity into it."""
+NOBODY = replace(EPOS4, vendor=0, product=0)
+
+
+def identity(vendor: int, product: int, *, revision: int = 0x01100000, doubt: str = "") -> Identity:
+    return Identity(5, vendor, product, revision, 9, "drive", "", "", doubt)
+
+
+MAXON = identity(0xFB, 0x61500000)
+
+
+@pytest.mark.parametrize(
+    ("drive_map", "who", "moved", "written", "hint"),
+    [
+        (EPOS4, MAXON, True, True, ""),
+        (EPOS4, identity(0xFB, 0x65510000), True, True, ""),
+        (EPOS4, identity(0xFB, 0x61500001), False, False, "give the map of this drive"),
+        (EPOS4, identity(0xFC, 0x61500000), False, False, "give the map of this drive"),
+        (OURS, MAXON, False, False, "give --map epos4"),
+        (GENERIC, MAXON, True, False, "write vendor = 0x000000fb, product = 0x61500000"),
+        (GENERIC, identity(0, 0), True, False, "names no vendor either"),
+        (NOBODY, MAXON, False, False, "write vendor = 0x000000fb"),
+        (NOBODY, identity(0, 0), False, False, "names no vendor either"),
+        (COPIED, identity(7, 8), True, True, ""),
+        (COPIED, identity(7, 9), False, False, "give the map of this drive"),
+        (replace(EPOS4, cells={}), MAXON, True, True, ""),  # scales nothing
+    ],
+)  # fmt: skip
+def test_a_map_is_for_the_drive_that_it_names(
+    drive_map: DriveMap, who: Identity, moved: bool, written: bool, hint: str, tmp_path: Path
+) -> None:
+    for allowed, check in (
+        (moved, lambda: check_motion(drive_map, who)),
+        (written, lambda: check_map(drive_map, who, JournalFolder(who, tmp_path))),
+    ):
+        if allowed:
+            check()
+            continue
+        with pytest.raises(ConfigError) as caught:
+            check()
+        assert hint in caught.value.hint and caught.value.where == "node 5, 0x1018"
+
+
+def test_how_a_map_and_a_drive_differ_is_said() -> None:
+    assert other_drive(EPOS4, 0xFB, 0x61500000) == "" == other_drive(EPOS4, 0xFB, 0x61500000, "")
+    assert other_drive(EPOS4, 0xFB, 0x61500000, "it calls itself otherwise") == "it calls itself otherwise"
+    assert "is for vendor 0x000000fb product 0x61500000, the drive is vendor 0x00000001 product 0x2" in other_drive(
+        EPOS4, 1, 2
+    )
+    assert "does not state whose drive it is for" in other_drive(GENERIC, 0xFB, 1)
+
+
+def test_the_map_a_drive_was_written_through_is_remembered(tmp_path: Path) -> None:
+    folder = JournalFolder(MAXON, tmp_path)
+    edited = replace(EPOS4, cells={**EPOS4.cells, "motor.pole_pairs": replace(EPOS4.cells["motor.pole_pairs"], sub=4)})
+    for drive_map in (EPOS4, edited):  # nothing is remembered yet
+        check_map(drive_map, MAXON, folder)
+    remember_map(EPOS4, folder)
+    check_map(EPOS4, MAXON, folder)
+    with pytest.raises(SafetyRefusal) as caught:
+        check_map(edited, MAXON, folder)
+    assert f"sha256 {map_hash(EPOS4)[:SHOWN]} then, {map_hash(edited)[:SHOWN]} now" in caught.value.what
+    assert str(memory_of(folder)) in caught.value.hint
+    memory_of(folder).write_text('{"map": 1}', encoding="utf-8")
+    with pytest.raises(ConfigError, match="damaged"):
+        check_map(EPOS4, MAXON, folder)
+    forget_map(folder)
+    check_map(edited, MAXON, folder)
+
+
+def test_of_a_drive_that_shows_its_layout_no_map_is_remembered(tmp_path: Path) -> None:
+    who = identity(OURS.vendor, OURS.product)
+    folder = JournalFolder(who, tmp_path)
+    for drive_map in (OURS, replace(EPOS4, cells={})):
+        remember_map(drive_map, folder)
+        assert not memory_of(folder).exists()
+    memory_of(folder).parent.mkdir(parents=True)
+    memory_of(folder).write_text('{"sha256": "another"}', encoding="utf-8")
+    check_map(OURS, who, folder)
+
+
+@pytest.mark.parametrize(
+    ("drive_map", "revision", "told"),
+    [
+        (EPOS4, 0x01100000, ""), (EPOS4, 0x01700001, ""), (EPOS4, 0x01110000, "describe 0x0110, 0x0170 (eds:"),
+        (EPOS4, 0x00000110, "firmware 0x00000110"), (load_family("ingenia"), 0x00010000, "do not say for which"),
+        (OURS, 0, ""), (replace(EPOS4, cells={}), 0, ""),
+    ],
+)  # fmt: skip
+def test_firmware_that_no_source_describes_is_told(drive_map: DriveMap, revision: int, told: str) -> None:
+    text = unknown_firmware(drive_map, identity(drive_map.vendor, drive_map.product, revision=revision))
+    assert (told in text) if told else text == ""
+
+
+def test_rows_that_the_drive_contradicts() -> None:
+    names = ["motor.pole_pairs", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as"]
+    with opened({DriveObject(0x3001, 3, "B"): 3, DriveObject(0x30A0, 1, "H"): 1}) as (_, connection):
+        wrong = contradictions(DriveNode(connection, NODE, drive_map=EPOS4), names)
+    assert wrong == {
+        "current.K_p_q_v_per_a": "the drive holds 2 bytes there",
+        "current.K_i_q_v_per_as": "the drive has no such object",
+    }
