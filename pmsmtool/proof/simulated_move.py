@@ -46,8 +46,9 @@ def hold(
     simulation.params.position_velocity_ff *= experiment.velocity_ff
     simulation.reference.mode = ControlMode.POSITION
     simulation.word(Part.ENABLED).value = 1
-    simulation.run(phase + round(HELD_S / T_s))
+    simulation.run(1)  # the first period clears the controllers
     simulation.floats_at(Part.SPEED_INTEGRAL, 1)[0] = held_nm
+    simulation.run(phase + round(HELD_S / T_s))
 
 
 def record_move(simulation: Simulation, experiment: Experiment) -> Array:
