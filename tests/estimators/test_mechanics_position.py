@@ -40,6 +40,16 @@ def test_the_encoder_s_step_is_seen_below_the_rounding_of_large_angles(bits: int
         assert encoder_step(recorded) == pytest.approx(true, rel=STEP_LIMIT)
 
 
+def test_a_fine_encoder_s_step_is_seen_on_a_shaft_that_changes_its_speed_by_many_of_them_from_row_to_row() -> None:
+    """A push to 800 rad/s in 0.18 s and coasting: second differences are 56 and 1000 steps of 22 bits, and more."""
+    true = 2.0 * math.pi / 2**22
+    t, slow = 1.38e-4 * np.arange(1300), 1.38e-3 * np.arange(380)
+    ways = -1.6 + 2200.0 * t**2, 0.5 + 520.0 * slow - 400.0 * slow**2
+    shown = [true * np.floor(way / true) for way in ways]
+    for recorded in (shown, [theta.astype(np.float32).astype(np.float64) for theta in shown]):
+        assert encoder_step(recorded) == pytest.approx(true, rel=STEP_LIMIT)
+
+
 def test_the_deviation_of_a_position_is_the_encoder_s_and_grows_with_binary32() -> None:
     rng = np.random.default_rng(2)
     step = 2.0 * math.pi / 2**19

@@ -192,7 +192,8 @@ def estimate_mechanics(
     if flagged:
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
     step = encoder_step([run["theta_M_rad"] for run in runs])
-    harmonics = angle_harmonics([(run.t_s, direction * run["theta_M_rad"]) for run in runs if run.meta["coasting"]])
+    coasted = [(run.t_s, direction * run["theta_M_rad"]) for run in runs if run.meta["coasting"]]
+    harmonics = angle_harmonics([(t_s, theta, position_std(theta, step)) for t_s, theta in coasted])
 
     def fitted(runs: Sequence[Trace]) -> Fitted:
         def blocks_of(J_kgm2: float) -> list[Run]:
