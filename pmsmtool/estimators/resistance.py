@@ -257,21 +257,23 @@ def estimate_resistance(
     _check_drift(drift)  # before the fit is judged: heating that is no straight line in time is no model mismatch
     best = min(fits, key=lambda fit: fit.chi2 / fit.dof)
     chi2 = best.chi2 / best.dof
-    if CHI2_REFUSE < chi2 <= CHI2_HOPELESS:
-        verdict, widen, misfit_ohm = Verdict.WARN, math.sqrt(chi2), math.sqrt(chi2) * sigma_v / peak
+    V_dead = V_vector * PHASE_FACTOR
+    curve = curve_from_levels(i, v_w - R_w * i - v_0 - V_link * np.sign(i) * fall, PHASE_FACTOR)
+    hidden = _hidden_in_knee(curve, V_dead, plateau_v)
+    misfit_ohm = math.sqrt(chi2) * sigma_v / peak
+    # a misfit that is small beside what the knee may hide is no reason to lose R, and what needs any of it
+    if CHI2_REFUSE < chi2 <= CHI2_HOPELESS or (CHI2_HOPELESS < chi2 and misfit_ohm < hidden):
+        verdict, widen = Verdict.WARN, math.sqrt(chi2)
     else:
         (verdict, widen), misfit_ohm = chi2_gate(chi2, STAGE), 0.0
     condition_gate(best.condition, "R_s and the inverter error", STAGE)
     variance = sum(
         w * (fit.covariance[0, 0] * widen**2 + (fit.x[0] - R_w) ** 2) for w, fit in zip(weights, fits, strict=True)
     )
-    V_dead = V_vector * PHASE_FACTOR
     hardness = abs(V_dead) / (R_w * peak)
     std = math.sqrt(float(variance)) * (HARD_FACTOR if hardness > HARD_RATIO else 1.0)
     std = math.hypot(std, DRIFT_SECOND_ORDER * abs(drift) * R_w, tolerance.voltage_scale_std * R_w, misfit_ohm)
-    _check_result(R_w, std)
-    curve = curve_from_levels(i, v_w - R_w * i - v_0 - V_link * np.sign(i) * fall, PHASE_FACTOR)
-    hidden = _hidden_in_knee(curve, V_dead, plateau_v)
+    _check_result(R_w, std, math.inf if COVERAGE_FACTOR * std < hidden else HALF_WIDTH_LIMIT)
     R_measured = Estimate(
         value=R_w,
         std=std,
@@ -493,8 +495,8 @@ def _check_drift(drift: float) -> None:
         )
 
 
-def _check_result(R: float, std: float) -> None:
-    if not R > 0.0 or COVERAGE_FACTOR * std > HALF_WIDTH_LIMIT * R:
+def _check_result(R: float, std: float, limit: float) -> None:
+    if not R > 0.0 or COVERAGE_FACTOR * std > limit * R:
         raise refuse(
             "E_NOT_IDENTIFIABLE",
             f"R_s and V_dead cannot be separated: R = {R:.4g} +- {COVERAGE_FACTOR * std:.2g} ohm (95 %), "

@@ -227,7 +227,8 @@ def test_levels_within_the_knee_of_the_inverters_error_say_so(straight: bool) ->
             assert WITHIN_KNEE in R.fallback or ratios[told][-1] <= 1.0 or not told
         usual = estimate_or_none(levels_of(d, k, rng), noise_of(d, k), float(d.dV[k]))
         assert usual is None or WITHIN_KNEE not in usual.fallback
-    assert len(ratios[True]) >= 55 and max(ratios[True]) <= 1.0  # measured 58, 0.63; straight 60, 0.70
+    # a misfit that is small beside what the knee may hide refuses none (chi-square 248 on a drive of 0.1 A at 800 V)
+    assert len(ratios[True]) >= 59 and max(ratios[True]) <= 1.0  # measured 59, 0.63; straight 60, 0.70
     # without the dead time nothing shows how much: measured 0.57; straight 1.00
     assert np.mean(np.array(ratios[False]) > 2.0) > 0.5
 
@@ -345,12 +346,22 @@ def test_a_winding_that_warms_by_its_own_losses(tau_s: float) -> None:
     assert abs(error) < half < 0.02, (error, half)
 
 
-def test_a_hard_drive_is_refused_by_name_when_the_interval_is_too_wide() -> None:
+def hard_drive(error: float, knee: float) -> tuple[Drives, np.random.Generator]:
+    """A drive whose inverter's error is so much of R I, with a soft knee at a share of I."""
     rng = np.random.default_rng(9)
     d = draw(1, rng)
-    d.dV[:] = 40.0 * d.R * d.I_r
-    d.knee[:] = 0.3 * d.I_r
-    d.shape[:] = 0.0
+    d.dV[:], d.knee[:], d.shape[:] = error * d.R * d.I_r, knee * d.I_r, 0.0
+    return d, rng
+
+
+def test_a_hard_drive_whose_levels_end_within_its_knee_has_an_interval_that_says_so() -> None:
+    d, rng = hard_drive(40.0, 0.3)
+    R = estimate_resistance(levels_of(d, 0, rng), noise_of(d, 0)).R_measured
+    assert abs(R.value - d.R[0]) < total_half_width(R) and total_half_width(R) > R.value and WITHIN_KNEE in R.fallback
+
+
+def test_a_hard_drive_is_refused_by_name_when_the_interval_is_too_wide() -> None:
+    d, rng = hard_drive(120.0, 0.1)
     with pytest.raises(IdentificationError) as caught:
         estimate_resistance(levels_of(d, 0, rng), noise_of(d, 0))
     assert caught.value.reason in ("E_NOT_IDENTIFIABLE", "E_MODEL_MISMATCH")
