@@ -2,8 +2,8 @@
 """What a machine file states, what the drive holds and what was measured, side by side, before anything is written.
 
 A measured value beyond the joint interval of measurement and data sheet contradicts the file. So does a value that was
-not measured where the drive holds another one that somebody has set. Whatever is left was not checked, and says so.
-Pure: numbers go in, rows come out.
+not measured where the drive holds another one that somebody has set, unless what was measured shows that the set is
+that of another motor. Whatever is left was not checked, and says so. Pure: numbers go in, rows come out.
 """
 
 from __future__ import annotations
@@ -54,6 +54,7 @@ ORDER = (
     "encoder_counts",
 )  # fmt: skip
 UNITS = {"encoder_counts": "1", RATIO: "kg m2/Wb", PHASE_INDUCTANCE: "H"}
+OTHER_MOTOR = "the drive holds the set of another motor, by what was measured"
 ACCEPTABLE = ("R_s_ohm", "L_q_h", "L_q_app_h", "J_kgm2", RATIO)
 """What a person may accept. Speed, torque and demagnetisation limits follow from psi, L_d, pole pairs and counts."""
 _TOGETHER = ({"J_kgm2", RATIO}, {"L_q_h", "L_q_app_h"})
@@ -216,6 +217,13 @@ def compare(
         if name in (RATIO, "L_q_app_h", PHASE_INDUCTANCE) and measured is None:
             continue  # stands for another row only where it was measured
         rows.append(row)
+    if stated is not None and _of_another_motor(rows, stated, loaded=loaded):
+        rows = [
+            replace(row, verdict="NOT CHECKED", cause="", tolerance=f"{row.tolerance}; {OTHER_MOTOR}")
+            if row.verdict == "contradicts" and row.measured is None and row.name in HELD and row.name not in used
+            else row
+            for row in rows
+        ]
     if any(row.name == "pole_pairs" and row.verdict == "contradicts" for row in rows):
         follow = ("psi_f_wb", "J_kgm2", RATIO)
         rows = [replace(row, cause=_BY_POLE_PAIRS) if row.cause and row.name in follow else row for row in rows]
@@ -295,6 +303,14 @@ def _judged(row: Row, file: MachineFile, found: Mapping[str, _Measured], *, used
     spread = max(high / stated, stated / low)
     good = 1.0 / spread <= row.held / stated <= spread
     return replace(row, verdict="NOT CHECKED" if good else "contradicts", cause="" if good else _cause(row, None))
+
+
+def _of_another_motor(rows: Sequence[Row], file: MachineFile, *, loaded: bool) -> bool:
+    """Whether most of what the drive holds would contradict values of the file that the measurement confirms."""
+    confirmed = [row for row in rows if row.verdict == "agrees" and None not in (row.measured, row.held)]
+    held = [replace(row, measured=None) for row in confirmed if row.name in HELD and not row.factory]
+    other = [_judged(row, file, {}, used=True, loaded=loaded).verdict == "contradicts" for row in held]
+    return sum(other) > 0.5 * len(other)
 
 
 def _exact(row: Row, *, used: bool) -> Row:

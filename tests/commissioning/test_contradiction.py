@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from pmsmtool.commissioning.compared_stage import check_accepted
-from pmsmtool.commissioning.contradiction import ACCEPTABLE, HELD, Row, compare
+from pmsmtool.commissioning.contradiction import ACCEPTABLE, HELD, OTHER_MOTOR, Row, compare
 from pmsmtool.errors import ConfigError, SafetyRefusal
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.params.parameter_set import default_set
@@ -197,6 +197,23 @@ def test_a_memory_of_another_motor_is_healthy_where_everything_is_measured() -> 
     held["encoder_counts"] = 2.0**17
     rows = compare(TRUTH, held, measured())
     assert not wrong(rows) and not unchecked([row.facts() for row in rows])
+
+
+def test_a_memory_of_another_motor_checks_nothing_of_what_was_refused() -> None:
+    """R of a motor of 0.1 A is refused beside a set of a motor of 50 A: no contradiction, and not checked either."""
+    other = {"pole_pairs": 7.0, "R_s_ohm": 0.1, "L_d_h": 1e-4, "L_q_h": 1e-4, "psi_f_wb": 0.01}
+    for refused in (["R_s_ohm"], ["R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2"]):
+        rows = compare(TRUTH, other, [v for v in measured() if v["name"] not in refused])
+        left = [row for row in rows if row.name in refused]
+        assert not wrong(rows) and {row.verdict for row in left} == {"NOT CHECKED"}
+        assert all(OTHER_MOTOR in row.text for row in left if row.held is not None)
+    # one value that differs is a wrong file, or one wrong value in the drive: the others still are this motor's
+    one = {**{key: getattr(TRUTH.machine, key) for key in HELD}, "L_d_h": 1e-4}
+    assert wrong(compare(stated(R_s_ohm=2.0), one, [v for v in measured() if v["name"] != "R_s_ohm"])) == ["R_s_ohm"]
+    # nothing measured, nothing known of whose set it is; a measurement that stands on the held value is none of its own
+    assert wrong(compare(TRUTH, other, [])) == [*other]
+    only = [v for v in measured() if v["name"] == "R_s_ohm"]
+    assert wrong(compare(TRUTH, other, only, used=("pole_pairs",))) == ["pole_pairs"]
 
 
 def test_a_refused_value_checks_nothing() -> None:
