@@ -41,7 +41,7 @@ from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
 from pmsmtool.identification.mechanics import NOT_RIGID, of_no_rigid_shaft, pushes_of, with_play_told
 from pmsmtool.identification.sampling import resistance_as_sampled
-from pmsmtool.identification.wiring import Finding, supply_under_load
+from pmsmtool.identification.wiring import Finding, supply_power, supply_under_load
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.plain_text import counted
@@ -67,6 +67,7 @@ class Evaluation:
     ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics``, ``frf``,
     ``cogging`` and ``harmonics``. ``inertia`` is that by mean accelerations, where the mechanics are refused.
     ``encoder_noise_rad`` is the standard deviation of a position at rest, without what drifts (mechanical).
+    ``supply_w`` is the power from which on the DC link gives way (W).
     """
 
     noise: Noise
@@ -75,6 +76,7 @@ class Evaluation:
     pairs: PairCheck | None = None
     resistance: ResistanceResult | None = None
     supply: Finding | None = None
+    supply_w: float = math.inf
     encoder: EncoderResult | None = None
     inductance: InductanceResult | None = None
     flux: FluxResult | None = None
@@ -235,7 +237,8 @@ def evaluate(
             return None
 
     if "levels" in traces:
-        result = replace(result, supply=supply_under_load(traces["zero_current"], traces["levels"]))
+        rest_and_load = traces["zero_current"], traces["levels"]
+        result = replace(result, supply=supply_under_load(*rest_and_load), supply_w=supply_power(*rest_and_load)[0])
         R = attempt("R", lambda: resistance_of(traces["levels"], result.noise, copper, tolerance, plateau_v))
         if R is not None:
             R = replace(R, R_s=widened(R.R_s, mismatch), R_measured=widened(R.R_measured, mismatch))

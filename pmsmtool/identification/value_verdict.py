@@ -16,7 +16,7 @@ from pmsmtool.identification import flux_map, frequency_response
 from pmsmtool.identification.evaluate import Evaluation
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
 from pmsmtool.identification.sampling import timing_warnings
-from pmsmtool.identification.wiring import WRONG
+from pmsmtool.identification.wiring import SUPPLY, WRONG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.run_directory import Acceptance
@@ -149,6 +149,8 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     for axis, fit in () if evaluation.inductance is None else evaluation.inductance.axes.items():
         if "eddy" in fit.effects:
             conditions |= {f"eddy_{axis}_s": fit.eddy_s, f"eddy_{axis}_time_s": fit.eddy_tau_s}
+    if math.isfinite(evaluation.supply_w):
+        conditions[SUPPLY] = evaluation.supply_w
     if evaluation.shown is not None:
         conditions["shown_instant_s"] = evaluation.shown.value_s
     if "frf" in request.measured:

@@ -285,6 +285,10 @@ def supply_under_load(at_rest: Trace, loaded: Trace) -> Finding | None:
     return judge_supply(float(np.mean(at_rest["U_dc_v"])), loaded, None)
 
 
+SUPPLY = "supply_w"
+"""Condition of a machine file: the power from which on its DC link gives way."""
+
+
 def supply_power(at_rest: Trace, loaded: Trace) -> tuple[float, float]:
     """Return the power from which on the DC link falls by :data:`SAGS`, and that of the largest current held (W).
 

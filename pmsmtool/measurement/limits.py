@@ -133,12 +133,17 @@ class Limits:
         return replace(self, I_nom_apk=share * self.I_test_apk, supply_w=supply_w) if supply_w < math.inf else self
 
     def within_supply(self, i_q_a: float, omega_rad_s: float, torque_per_a: float) -> tuple[float, float]:
-        """Return current (A) and mechanical speed (rad/s) that together take no more than the supply gives.
+        """Return current (A) and mechanical speed (rad/s) that take no more than the supply gives."""
+        return within_supply(self.supply_w, i_q_a, omega_rad_s, torque_per_a)
 
-        The current is reduced first, for intervals grow as the speed falls, but not below :data:`LEAST_CURRENT`, which
-        must move the shaft. ``torque_per_a`` is in N m per ampere of q current.
-        """
-        taken_w = i_q_a * omega_rad_s * torque_per_a
-        share = min(1.0, self.supply_w / taken_w) if taken_w > 0.0 else 1.0
-        less = max(share, LEAST_CURRENT)
-        return less * i_q_a, share / less * omega_rad_s
+
+def within_supply(supply_w: float, i_q_a: float, omega_rad_s: float, torque_per_a: float) -> tuple[float, float]:
+    """Return current (A) and mechanical speed (rad/s) that together take no more than a power (W).
+
+    The current is reduced first, for intervals grow as the speed falls, but not below :data:`LEAST_CURRENT`, which
+    must move the shaft. ``torque_per_a`` is in N m per ampere of q current.
+    """
+    taken_w = i_q_a * omega_rad_s * torque_per_a
+    share = min(1.0, supply_w / taken_w) if taken_w > 0.0 else 1.0
+    less = max(share, LEAST_CURRENT)
+    return less * i_q_a, share / less * omega_rad_s

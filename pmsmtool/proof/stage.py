@@ -38,7 +38,9 @@ from pmsmtool.errors import (
 )
 from pmsmtool.files import make_folder, write_file
 from pmsmtool.flash.restore import plan_download
+from pmsmtool.identification.wiring import SUPPLY
 from pmsmtool.machine.parameters import Brake, Load, Shaft
+from pmsmtool.measurement.limits import within_supply
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.proof.judgement import Judgement, judge, with_ripple
 from pmsmtool.proof.measured import SpeedNotReached, run_experiments
@@ -134,12 +136,19 @@ def _sagged(experiment: Experiment, trace: Trace, conditions: Conditions) -> str
 
 
 def envelope_of(design: Design, request: ProofRequest, plan: ProofPlan | None = None) -> Envelope:
-    """Return the motion envelope: what the request says, else the design's largest current and speed."""
+    """Return the motion envelope: what the request says, else the design's largest current and speed.
+
+    On a supply that gives way less of both, so that a current at any speed leaves the DC link up.
+    """
     T_s, slope = design.machine.inverter.T_s, design["speed.acceleration_rpm_per_s"] * RPM
     i_max = design["motor.I_max_apk"] if request.i_max_apk is None else request.i_max_apk
+    speed_max = design["motor.n_max_rpm"] * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s
+    supply_w = design.machine.conditions.get(SUPPLY)
+    if isinstance(supply_w, float):
+        i_max, speed_max = within_supply(supply_w, i_max, speed_max, abs(design.machine.machine.torque_nm(0.0, 1.0)))
     return Envelope(
         i_max_apk=i_max,
-        speed_max_rad_s=design["motor.n_max_rpm"] * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,
+        speed_max_rad_s=speed_max,
         duration_s=60.0 if plan is None else 45.0 + 2.0 * plan.seconds(T_s, slope),
         shaft=request.shaft,
         load=request.load,

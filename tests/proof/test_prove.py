@@ -32,13 +32,15 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.errors import Declined, Interrupted, VerifyMismatch
 from pmsmtool.flash.restore import take_backup
+from pmsmtool.identification.wiring import SUPPLY
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.measurement.limits import LEAST_CURRENT
 from pmsmtool.proof import measured
 from pmsmtool.proof import stage as stages
 from pmsmtool.proof.judgement import judge, with_ripple
 from pmsmtool.proof.plan import Conditions
-from pmsmtool.proof.stage import ProofRequest, _too_slow, prove_stage, read_proof, responses
+from pmsmtool.proof.stage import ProofRequest, _too_slow, envelope_of, prove_stage, read_proof, responses
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.sim.kernel import Params
@@ -233,6 +235,18 @@ def test_what_a_sagging_link_decides_is_not_judged(design: Design) -> None:
     left = [line for line in stage.fallbacks if "not judged: under load the DC link falls from 540 to" in line]
     assert left and not [line for line in stage.acceptance if line.what.startswith("unreachable")]
     assert [line for line in stage.acceptance if line.what.startswith("q_steps")], "the rest is"
+
+
+def test_a_supply_that_gives_way_bounds_the_power_of_a_proof(design: Design) -> None:
+    """540 V behind 25 ohm: a proof at all of the current ended in the drive's under-voltage fault."""
+    supply_w, per_a = 300.0, design.machine.machine.torque_nm(0.0, 1.0)
+    machine = replace(design.machine, conditions={**design.machine.conditions, SUPPLY: supply_w})
+    usual, weak = (envelope_of(one, ProofRequest()) for one in (design, replace(design, machine=machine)))
+    assert usual.i_max_apk * usual.speed_max_rad_s * per_a > 2.0 * supply_w
+    assert weak.i_max_apk * weak.speed_max_rad_s * per_a == pytest.approx(supply_w)
+    assert weak.i_max_apk >= LEAST_CURRENT * usual.i_max_apk
+    asked = ProofRequest(i_max_apk=1.0, speed_max_rad_s=50.0)
+    assert envelope_of(replace(design, machine=machine), asked) == envelope_of(design, asked)
 
 
 def test_the_link_is_known_beside_its_ripple(design: Design) -> None:
