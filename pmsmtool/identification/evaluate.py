@@ -13,7 +13,7 @@ import numpy as np
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.estimators.cross_check import CrossCheck, cross_check
 from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_encoder_counts, estimate_encoder
-from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult, check_magnet, estimate_flux_linkage
 from pmsmtool.estimators.flux.map_result import FluxMapResult
 from pmsmtool.estimators.injection.axis_layout import Motion
@@ -53,6 +53,8 @@ RELUCTANCE_STD = 0.3
 """Standard deviation of what reluctance takes from it, relative: the inductances are rough and incremental."""
 FIXED = ("levels", "square_", "angle_")
 """Beginnings of the names of traces whose current vector keeps its angle."""
+NOTABLY_WIDER = 1.2
+"""Growth of a total interval from which on a reader is told of what makes it wider."""
 MOSFET_LINK_V = 100.0
 """Below this DC link bridges are made of MOSFETs, which have no threshold."""
 
@@ -119,7 +121,10 @@ class Evaluation:
             first = self.flux.psi_f
             apart = self.flux.apart_wb * first.value / self.flux.psi_measured.value
             alone = replace(first, std=math.sqrt(max(0.0, first.std**2 - apart**2)))
-            found.append(cross_check("psi_f_wb_driven", "psi_f_wb", self.flux.driven, alone, common))
+            wider = total_half_width(first) > NOTABLY_WIDER * total_half_width(alone)
+            # what they are apart is in the interval of psi_f: it is an alarm where that is another interval by it
+            judged = alone if wider else first
+            found.append(cross_check("psi_f_wb_driven", "psi_f_wb", self.flux.driven, judged, common))
         if self.flux is not None and self.inductance is not None:
             found.append(cross_check("L_q_h_apparent", "L_q_h", self.flux.L_q_app, self.inductance.L_q))
         return found

@@ -13,7 +13,7 @@ from pmsmtool.estimators.cross_check import CrossCheck
 from pmsmtool.estimators.estimate import Verdict, coverage_factor, statistical_half_width, total_half_width
 from pmsmtool.estimators.resistance import at_the_test
 from pmsmtool.identification import flux_map, frequency_response
-from pmsmtool.identification.evaluate import Evaluation
+from pmsmtool.identification.evaluate import NOTABLY_WIDER, Evaluation
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
 from pmsmtool.identification.sampling import timing_warnings
 from pmsmtool.identification.wiring import SUPPLY, WRONG
@@ -53,8 +53,6 @@ def had_of(evaluation: Evaluation) -> list[str]:
     return [name for name, result in results.items() if result is not None]
 
 
-ASSUMPTION_TOLD = 1.2
-"""Growth of the systematic interval of psi_f by the way to the reference temperature from which on a reader is told."""
 STANDS_FOR: Mapping[str, str] = {"L_q_app_h": "L_q_h", "J_per_psi": "J_kgm2"}
 """Values of a drive without injection, and the machine key whose place they take: loops depend on the ratio J/psi."""
 
@@ -108,7 +106,7 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
             if error > 0.0
         ]
     flux = evaluation.flux
-    if flux is not None and flux.psi_f.systematic > ASSUMPTION_TOLD * flux.psi_measured.systematic:
+    if flux is not None and flux.psi_f.systematic > NOTABLY_WIDER * flux.psi_measured.systematic:
         lines.append(
             "psi_f at the reference temperature rests on an assumed temperature coefficient of the magnets: its range, "
             "samarium-cobalt to ferrite, is in the interval; state alpha_psi_per_k and alpha_psi_tolerance_per_k"
