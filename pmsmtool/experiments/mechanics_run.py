@@ -3,7 +3,9 @@
 
 A push from rest, coasting, a push the other way through standstill, coasting (docs/identification.md, 3.5). The shaft
 coasts with the voltage off: the sampled current of a switched bridge is not the mean of its ripple, which at commanded
-zero current leaves a torque of a part in a thousand of the rated one, as much as a good bearing's friction.
+zero current leaves a torque of a part in a thousand of the rated one, as much as a good bearing's friction. A shaft
+that friction stops while its push is read out coasts within the record of the push, without a current: beside such a
+friction that torque is small.
 
 Turns at a low speed under the speed controller, both ways: current and position show what torque the angle adds.
 
@@ -15,6 +17,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
 from pmsmtool.experiments.signals import readable
@@ -31,6 +35,10 @@ UNIT_LEAST_S, UNIT_MOST_S = 0.03, 0.6
 """Shortest and longest push: the current loop needs milliseconds, a person's patience ends somewhere."""
 COAST_UNITS, COAST_LEAST_S, COAST_MOST_S = 6.0, 0.5, 2.5
 """Time of coasting, in pushes, and its bounds."""
+LEFT_LEAST = 0.5
+"""Speed at the begin of a coasting, of that at the end of the push, below which most of it was over before."""
+CURRENT_OFF = 0.05
+"""Current, of the push's, below which a shaft coasts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +101,18 @@ def push_and_coast(drive: Drive, plan: MechanicsPlan, abort_speed_rad_s: float, 
     (electrical rad/s).
     """
     first = _push(drive, plan.i_q_a, plan.unit_s, plan.rows, abort_speed_rad_s)
-    keep(first)
     coasting = _coast(drive, plan)
+    if abs(_speed(coasting, first_rows=True)) < LEFT_LEAST * abs(_speed(first)):
+        for sign in (1.0, -1.0):
+            drive.enable()
+            whole = _push(drive, sign * plan.i_q_a, plan.unit_s, plan.rows, abort_speed_rad_s, COAST_LEAST_S)
+            for part in _parts(whole, sign * plan.i_q_a, plan.unit_s):
+                keep(part)
+        drive.disable()
+        return
+    keep(first)
     keep(coasting)
-    reached, left = abs(_end_speed(first)), abs(_end_speed(coasting))
+    reached, left = abs(_speed(first)), abs(_speed(coasting))
     # what the first push really did decides how long the other one may be: the plan's inertia is a rough one
     both = min(2.0 * reached, reached + left, 2.0 * plan.omega_rad_s)
     drive.enable()
@@ -112,19 +128,34 @@ def _coast(drive: Drive, plan: MechanicsPlan) -> Trace:
     return replace(trace, meta={**trace.meta, "coasting": True})
 
 
-def _end_speed(trace: Trace) -> float:
-    """Mean speed over the last twentieth of a trace (rad/s mechanical)."""
+def _parts(whole: Trace, i_q_a: float, push_s: float) -> tuple[Trace, Trace]:
+    """Return push and coasting of a record that has both."""
+    flows = np.nonzero(np.abs(whole["i_q_a"]) > CURRENT_OFF * abs(i_q_a))[0]
+    ends = int(push_s / whole.period_s), min(int(flows[-1]) + 1, len(whole) - 2)
+    push, coasting = (
+        replace(whole, t_s=whole.t_s[part] - whole.t_s[part][0], signals={n: whole[n][part] for n in whole.signals})
+        for part in (slice(0, ends[0]), slice(ends[1], None))
+    )
+    return push, replace(coasting, meta={**whole.meta, "coasting": True})
+
+
+def _speed(trace: Trace, *, first_rows: bool = False) -> float:
+    """Mean speed over the last twentieth of a trace, or the first (rad/s mechanical)."""
     rows = max(2, len(trace) // 20)
-    return float(trace["theta_M_rad"][-1] - trace["theta_M_rad"][-rows]) / ((rows - 1) * trace.period_s)
+    theta = trace["theta_M_rad"][:rows] if first_rows else trace["theta_M_rad"][-rows:]
+    return float(theta[-1] - theta[0]) / ((rows - 1) * trace.period_s)
 
 
-def _push(drive: Drive, i_q_a: float, seconds: float, rows: int, abort_speed_rad_s: float) -> Trace:
-    samples, decimation = _rows(drive, seconds, rows)
+def _push(
+    drive: Drive, i_q_a: float, seconds: float, rows: int, abort_speed_rad_s: float, coasting_s: float = 0.0
+) -> Trace:
+    """Push, and go on recording for a while without a current."""
+    samples, decimation = _rows(drive, seconds + coasting_s, rows)
     excitation = Excitation(
         shape=Shape.STEP,
         point=Injection.I_Q,
         amplitude=i_q_a,
-        duration_s=samples * decimation * drive.period_s,
+        duration_s=seconds if coasting_s else samples * decimation * drive.period_s,
         abort_speed_rad_s=abort_speed_rad_s,
     )
     drive.command_current(0.0, 0.0)
