@@ -1,5 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""The page of ``pmsmtool scope``: a ring of samples, and a server on 127.0.0.1 that streams them to browsers.
+"""A live page: a ring of samples, and a server on 127.0.0.1 that streams them to browsers.
+
+``scope`` streams signals, ``report --follow`` the number of its latest drawing.
 
 One thread writes the ring and waits for nobody. Each browser has a thread of its own that follows the ring
 (Server-Sent Events, HTML standard, section 9.2); one that does not read is dropped, one that is late misses samples.
@@ -144,19 +146,25 @@ class LiveServer(socketserver.ThreadingTCPServer):
                 f"cannot listen: {error.strerror or error}", where=f"{HOST}:{port}",
                 likely="another program listens there", hint="choose another --port; 0 takes a free one",
             ) from error  # fmt: skip
-        self.page = page.encode()
+        self.show(page)
         self.samples = samples
         self.head = head
         self.streams = 0
         port = self.server_address[1]
         self.url = f"http://{HOST}:{port}/"
         self.hosts = frozenset({f"{HOST}:{port}", f"localhost:{port}"})
+        self._places = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self._lock = threading.Lock()
+
+    def show(self, page: str) -> None:
+        """Serve another page from now on."""
         scripts = re.findall(r"<script>(.*?)</script>", page, re.DOTALL)
         hashes = (base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in scripts)
         allowed = " ".join(f"'sha256-{text}'" for text in hashes)
-        self.policy = f"default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; script-src {allowed}"
-        self._places = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        self._lock = threading.Lock()
+        policy = (
+            f"default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; script-src {allowed}"
+        )
+        self.shown = page.encode(), f"{policy} 'wasm-unsafe-eval'"
 
     @contextmanager
     def streaming(self) -> Iterator[None]:
@@ -215,8 +223,9 @@ class _Request(BaseHTTPRequestHandler):
         if [host.strip().lower() for host in self.headers.get_all("Host", [])][:2] not in self._allowed():
             self.send_error(403, "not the address of this page")
         elif self.path == "/":
-            self._begin("text/html; charset=utf-8")
-            self.wfile.write(self.server.page)
+            page, policy = self.server.shown
+            self._begin("text/html; charset=utf-8", policy)
+            self.wfile.write(page)
         elif self.path == "/samples":
             self._begin("text/event-stream")
             with self.server.streaming():
@@ -227,12 +236,12 @@ class _Request(BaseHTTPRequestHandler):
     def _allowed(self) -> list[list[str]]:
         return [[host] for host in self.server.hosts]
 
-    def _begin(self, kind: str) -> None:
+    def _begin(self, kind: str, policy: str = "default-src 'none'") -> None:
         self.send_response(200)
         self.send_header("Content-Type", kind)
         self.send_header("Cache-Control", "no-store")
         self.send_header("X-Content-Type-Options", "nosniff")
-        self.send_header("Content-Security-Policy", self.server.policy)
+        self.send_header("Content-Security-Policy", policy)
         self.end_headers()
 
     def _stream(self) -> None:

@@ -1,30 +1,36 @@
 # SPDX-License-Identifier: MIT
-"""``pmsmtool report``: the page a person reads and signs.
-
-A page to a PDF, by a browser of this computer without a window.
-"""
+"""``pmsmtool report``: the page a person reads and signs, and the same page while its run goes on."""
 
 from __future__ import annotations
 
 import os
-import shutil
-import subprocess
 import sys
-import tempfile
+import time
+from contextlib import suppress
+from html import escape
 from pathlib import Path
 
 import click
 
-from pmsmtool.cli.options import FILE, examples, output_options
+from pmsmtool.cli.options import DURATION, FILE, WholeNumber, examples, output_options
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import write_file
+
+LOOK_S = 1.0
+"""The run's folder is looked at this often."""
+NICENESS = 5
+"""What measures comes first; for the same reason drawing (2 to 5 s of processor time) pauses as long as it took."""
+RELOAD = """<script>const shown = {}; const news = new EventSource("/samples");
+news.addEventListener("samples", e => {{ if (JSON.parse(e.data).at(-1)[0] > shown) location.reload(); }});
+news.addEventListener("end", () => news.close());</script>"""
 
 
 @click.command(
     "report",
     epilog=examples(
         "pmsmtool report runs/20260101T120000Z-000055f1",
+        "pmsmtool report --follow runs",
         "pmsmtool report --pdf runs/20260101T120000Z-000055f1",
         "pmsmtool report --junit runs/20260101T120000Z-000055f1 -o result.xml",
         "pmsmtool report --anonymous runs/20260101T120000Z-000055f1 -o to-send.json",
@@ -37,21 +43,35 @@ from pmsmtool.files import write_file
 @click.option("--junit", is_flag=True, help="Instead of the page JUnit XML for a test system: a case per criterion.  "
               "[default: junit.xml in the run directory]")  # fmt: skip
 @click.option("--pdf", is_flag=True, help="The page as PDF as well, by Chromium, Chrome or Edge; beside the page.")
+@click.option("--follow", is_flag=True, help="Serve the page to browsers of this computer while the run goes on; "
+              "of a folder of runs that of the newest.")  # fmt: skip
+@click.option("--for", "seconds", type=DURATION, help="--follow ends after this time; default: Ctrl-C.")
+@click.option("--port", type=WholeNumber("port", 0, 65535), default=0, help="Port of --follow; 0 takes a free one.")
 @output_options
-def report_command(run: Path, path: Path | None, anonymous: bool, junit: bool, pdf: bool, out: Output) -> None:
+def report_command(
+    run: Path, path: Path | None, anonymous: bool, junit: bool, pdf: bool, follow: bool, seconds: float | None,
+    port: int, out: Output,
+) -> None:  # fmt: skip
     """Write the report of a RUN directory: one self-contained HTML page, verdict first.
 
     Every figure is drawn from the files of the run. The exit code is that of writing the page, not the verdict of the
     run.
 
+    --follow shows the page while `identify`, `prove` or `commission` runs in another terminal: figures come as traces
+    come, of a proof the committed band first. It is for browsers on this computer only (127.0.0.1).
+
     --anonymous makes a file to send to the authors of pmsmtool: no serial number, no name of a person, drive, machine,
     computer or file, no date, no text of the run. Read it before you send it: it is plain text.
     """
-    if anonymous + junit + pdf > 1:
-        raise click.UsageError("--anonymous, --junit and --pdf make different files: give one of them")
+    if anonymous + junit + pdf + follow > 1:
+        raise click.UsageError("--anonymous, --junit, --pdf and --follow exclude each other: give one of them")
+    if follow:
+        _follow(run, seconds, port, out)
+        return
     if anonymous:
         _write_anonymous(run, run / "anonymous.json" if path is None else path, out)
         return
+    from pmsmtool.commissioning.printed_page import print_page, require_browser
     from pmsmtool.commissioning.report_page import how_it_ended, report_page, verdict
 
     if pdf:
@@ -93,62 +113,64 @@ def _write_anonymous(run: Path, path: Path, out: Output) -> None:
     out.note(f"wrote {path}")
 
 
-BROWSER = "PMSMTOOL_BROWSER"
-"""Environment variable with the program, where it is not found by name."""
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge", "microsoft-edge")
-PLACES = {
-    "win32": (
-        r"C:\Program Files\Google\Chrome\Application\chrome.exe",
-        r"C:\Program Files (x86)\Microsoft\Edge\Application\msedge.exe",
-    ),
-    "darwin": ("/Applications/Google Chrome.app/Contents/MacOS/Google Chrome",),
-}
-"""Where browsers lie that are not on the path, by ``sys.platform``."""
-LIMIT_S = 120.0
-"""A browser that takes longer is ended; seen: 2 s, 9 s on a busy computer."""
-QUIET = (
-    "--headless", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--no-pdf-header-footer",
-)  # fmt: skip
-_WITHOUT = "or open the page in any browser and print it: it is laid out for A4 and Letter"
+def _follow(path: Path, seconds: float | None, port: int, out: Output) -> None:
+    """Serve the page of a run, drawn again when a file of the run has changed."""
+    from pmsmtool.cli.live_server import LiveServer, Samples
 
-
-def find_browser() -> str | None:
-    """Return a program that prints pages: Chromium, Chrome or Edge; None where there is none."""
-    given = os.environ.get(BROWSER)
-    if given:
-        return shutil.which(given)
-    found = (shutil.which(name) for name in (*NAMES, *PLACES.get(sys.platform, ())))
-    return next((path for path in found if path), None)
-
-
-def require_browser() -> str:
-    """Return the browser; raises ``ConfigError`` where none is found."""
-    browser = find_browser()
-    if browser is None:
-        raise ConfigError(
-            "no browser was found to make a PDF", where=os.environ.get(BROWSER, ""),
-            likely="Chromium, Chrome and Edge are looked for", hint=f"install one, or name it in {BROWSER}; {_WITHOUT}",
-        )  # fmt: skip
-    return browser
-
-
-def print_page(page: Path, pdf: Path) -> None:
-    """Print an HTML page to a PDF; raises ``ConfigError`` where no browser is found, or it wrote nothing."""
-    browser = require_browser()
-    # a browser of the administrator (a container, a build server) does not start inside its own sandbox
-    alone = ("--no-sandbox",) if getattr(os, "geteuid", lambda: 1)() == 0 else ()
-    with tempfile.TemporaryDirectory(prefix="pmsmtool-", ignore_cleanup_errors=True) as folder:
-        made = Path(folder) / "page.pdf"
-        command = [browser, *QUIET, *alone, f"--user-data-dir={folder}/profile", f"--print-to-pdf={made}"]
+    if not path.is_dir():
+        raise ConfigError("there is no such folder", where=str(path), hint="give a run directory, or the folder runs")
+    drawings = Samples((), 1)
+    begin = f"<!doctype html><title>report</title><p>no run yet in {escape(str(path))}</p>"
+    server = LiveServer(port, begin + RELOAD.format(0), drawings, {})
+    if hasattr(os, "nice"):
+        os.nice(NICENESS)
+    latest = time.monotonic() + seconds if seconds else float("inf")
+    before: object = None
+    with server.serving():
+        out.result("report-follow", {"url": server.url}, [server.url])
+        sys.stdout.flush()
+        out.note("open it in a browser on this computer; " + (f"{seconds:g} s" if seconds else "Ctrl-C ends it"))
         try:
-            subprocess.run([*command, page.resolve().as_uri()], capture_output=True, timeout=LIMIT_S, check=False)
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise ConfigError(f"the browser made no PDF: {error}", where=browser, hint=_WITHOUT) from error
-        if not made.is_file():
-            raise ConfigError("the browser made no PDF", where=browser, hint=_WITHOUT)
-        try:
-            shutil.copyfile(made, pdf)
-        except OSError as error:
-            hint = "name a file that can be written"
-            raise ConfigError(error.strerror or str(error), where=str(pdf), hint=hint) from error
+            while time.monotonic() < latest:
+                begun = time.process_time()
+                run = _newest(path)
+                files = run and _files(run)
+                if run and files != before:
+                    before = files
+                    server.show(_page(run, drawings.count + 1))
+                    drawings.add(drawings.count + 1, ())
+                    out.status(f"{run.name}: drawn {drawings.count} times")
+                pause = max(LOOK_S, time.process_time() - begun)
+                time.sleep(max(0.0, min(pause, latest - time.monotonic())))
+        except KeyboardInterrupt:
+            if seconds:
+                raise  # asked for a time and interrupted before
+
+
+def _newest(path: Path) -> Path | None:
+    """Return the run that is followed: the folder itself, or the newest run in it; None where there is none yet."""
+    from pmsmtool.run_directory import RECORD
+
+    return (
+        path if (path / RECORD).is_file() else max((found.parent for found in path.glob(f"*/{RECORD}")), default=None)
+    )
+
+
+def _files(run: Path) -> list[tuple[str, int]]:
+    """Return what tells whether a run has changed; a file that is being replaced counts when it is there again."""
+    found = []
+    for path in sorted(run.rglob("*.*")):
+        with suppress(OSError):
+            found.append((str(path), path.stat().st_mtime_ns))
+    return found
+
+
+def _page(run: Path, number: int) -> str:
+    """Return the report of a run as it is now, which loads itself again when a later one is drawn."""
+    from pmsmtool.commissioning.report_page import report_page
+
+    try:
+        page = report_page(run)
+    except ConfigError as error:
+        page = f"<!doctype html><title>report</title><p>{escape(str(error))}</p>"
+    return page + RELOAD.format(number)

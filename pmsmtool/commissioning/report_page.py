@@ -37,7 +37,7 @@ from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.run_account import account_lines
 from pmsmtool.npz_file import read_npz
 from pmsmtool.proof.judgement import judge, with_ripple
-from pmsmtool.proof.stage import read_proof, responses
+from pmsmtool.proof.stage import FOLDER, PREDICTION, read_proof, responses
 from pmsmtool.report import figures
 from pmsmtool.report.report import Change, Figure, Table, render
 from pmsmtool.report.verdict import COMPLETE, Verdict, is_simulated, verdict_of
@@ -240,10 +240,12 @@ def _table_figures(path: Path) -> Iterator[Figure]:
 def _proof_figures(run: RunDirectory, record: RunRecord, design: Design | None) -> Iterator[Figure]:
     """Draw the latest proof: what was committed before the first step, and what was measured, verdict first."""
     stage = record.stage("prove")
-    names = [name for name in (stage.files if stage else {}) if name.endswith("/prediction.npz")]
-    if not names or not (run.path / names[0]).is_file():
+    named = [run.path / name for name in (stage.files if stage else {}) if name.endswith(f"/{PREDICTION}")]
+    begun = sorted(run.path.glob(f"{FOLDER}/*/{PREDICTION}"), key=lambda path: path.stat().st_mtime_ns, reverse=True)
+    committed = next((path for path in named or begun if path.is_file()), None)
+    if committed is None:
         return
-    prediction, traces = read_proof((run.path / names[0]).parent)
+    prediction, traces = read_proof(committed.parent)
     found = responses(traces, prediction)
     prediction = with_ripple(prediction, traces)
     judgement = judge(prediction, found)

@@ -9,7 +9,7 @@ import pytest
 
 import pmsmtool
 from pmsmtool.bus.connect import _why_closed
-from pmsmtool.cli.report import BROWSER
+from pmsmtool.commissioning.printed_page import BROWSER
 from pmsmtool.machine.profile import machine_path
 from tests.cli.conftest import Tool
 

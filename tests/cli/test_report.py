@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 from pmsmtool.cli.main import run as program
-from pmsmtool.cli.report import LIMIT_S, QUIET, find_browser, print_page
 from pmsmtool.commissioning import report_page
 from pmsmtool.commissioning.design_stages import lut_stage, tune_stage
+from pmsmtool.commissioning.printed_page import LIMIT_S, QUIET, find_browser, print_page
 from pmsmtool.design.design_file import load_design
 from pmsmtool.design.lookup.design import LookupRequest
 from pmsmtool.design.loops.open_loops import open_loops

@@ -14,8 +14,8 @@ import pytest
 
 from benchmarks.recomputed_page import differing, random_design, random_moves
 from pmsmtool import native
-from pmsmtool.cli.report import QUIET, find_browser
 from pmsmtool.commissioning import recomputed_page
+from pmsmtool.commissioning.printed_page import QUIET, find_browser
 from pmsmtool.commissioning.recomputed_page import loop_margins, recomputed
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.loops.margins import margin_problem

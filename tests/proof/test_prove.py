@@ -42,7 +42,7 @@ from pmsmtool.proof.judgement import judge, with_ripple
 from pmsmtool.proof.plan import Conditions
 from pmsmtool.proof.stage import ProofRequest, _too_slow, envelope_of, prove_stage, read_proof, responses
 from pmsmtool.resources import data_folder
-from pmsmtool.run_directory import RunDirectory, Stage
+from pmsmtool.run_directory import RECORD, RunDirectory, Stage
 from pmsmtool.sim.kernel import Params
 
 pytestmark = pytest.mark.chain
@@ -134,6 +134,12 @@ def test_a_healthy_drive_passes_and_the_prediction_came_first(design: Design) ->
     assert [line.share for line in again.seen] == [v["value"] for v in stage.values if "where" in v]
     page = report_page(run.path)
     assert page.count("inside its band") == 7 and "Behaviour: the drive" not in page
+    record = json.loads((run.path / RECORD).read_text(encoding="utf-8"))
+    (run.path / RECORD).write_text(json.dumps({**record, "stages": []}), encoding="utf-8")
+    (folder / "move_lag.npz").unlink()
+    page = report_page(run.path)
+    assert page.count("inside its band") == 6, "what was measured until it was killed"
+    assert page.count("Proof 7, not run") == 1
 
 
 @pytest.mark.parametrize(
