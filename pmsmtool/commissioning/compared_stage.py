@@ -58,11 +58,10 @@ _NEVER = (
 
 def held_values(drive: CanopenDrive) -> dict[str, float]:
     """Return what a drive holds of the machine, by key; what it does not show is left out."""
-    held = {}
+    held: dict[str, float] = {}
     for key in HELD:
-        if f"motor.{key}" in drive.node.map.cells:
-            with contextlib.suppress(SdoAbort):
-                held[key] = drive.parameters.read_value(f"motor.{key}")
+        value = drive.parameters.held_value(f"motor.{key}")
+        held |= {} if value is None else {key: value}
     with contextlib.suppress(SdoAbort):
         if drive.node.has(ENCODER_COUNTS.index, ENCODER_COUNTS.sub):
             counts = drive.node.get(ENCODER_COUNTS) / max(1.0, drive.node.get(MOTOR_TURNS))

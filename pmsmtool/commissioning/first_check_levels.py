@@ -219,10 +219,10 @@ def _counts(drive: StandardDrive, stated: MachineFile) -> Finding:
 
 def _held_pole_pairs(drive: CanopenDrive, stated: MachineFile) -> list[Finding]:
     """Compare the pole pairs that the drive is set for, where its map knows them; that is no measurement."""
-    if POLE_PAIRS not in drive.node.map.cells:
+    held, said = drive.parameters.held_value(POLE_PAIRS), round(stated.machine.pole_pairs)
+    if held is None:
         return []
-    held, said = round(drive.parameters.read_value(POLE_PAIRS)), round(stated.machine.pole_pairs)
-    if held == said:
+    if round(held) == said:
         return [Finding("pole pairs", NOT_CHECKED, f"the drive is set for the stated {said}; not measured")]
-    shown = f"the drive is set for {held}, {said} are stated"
+    shown = f"the drive is set for {held:.0f}, {said} are stated"
     return [Finding("pole pairs", WRONG, shown, "poles given for pole pairs, or another motor's set-up")]

@@ -38,7 +38,7 @@ class ChangedObjects:
     def held_before(self, item: objects.DriveObject) -> float | None:
         """Return what an object held before it was changed; None where it was not."""
         data = self._before.get((item.index, item.sub))
-        return None if data is None else item.decode(data)
+        return None if data is None else self._node.typed(item).decode(data)
 
     def restore(self) -> int:
         """Bring back what was changed, read it back, and note nothing more; return how many objects.
@@ -49,7 +49,9 @@ class ChangedObjects:
             An object does not hold its old content; each is named.
         """
         self._node.before_write = None
-        names = {self._drive.parameters.map.address(n): n for n in (*self._node.map.cells, *self._node.map.tables)}
+        drive_map = self._node.map
+        staged = (*drive_map.cells, *drive_map.tables) if drive_map.staging else ()
+        names = {drive_map.address(name): name for name in staged}
         parameters = {names[key]: data for key, data in self._before.items() if key in names}
         others = {key: data for key, data in self._before.items() if key not in names}
         changed = {n: data for n, data in parameters.items() if self._drive.parameters.read([n])[n] != data}

@@ -40,6 +40,9 @@ IDENTITY_BYTES = 4
 LONGEST_NAME = 256
 """Bytes of 0x1008 to 0x100A that are read; drives use up to 64."""
 
+NOT_READ = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY)
+"""Refusals to read an object that count as missing: what cannot be read back proves nothing."""
+
 Watcher = Callable[[int, int], None]
 """Called with index and sub-index before an object is written."""
 
@@ -77,6 +80,7 @@ class DriveNode:
         self.sdo.slow_objects[objects.STORE_ALL] = STORE_TIMEOUT_S
         self.before_write: Watcher | None = None
         self.before_close: list[Callable[[], object]] = []
+        self._lengths: dict[tuple[int, int], int] = {}
         connection.at_close.append(self.close)
 
     def close(self) -> None:
@@ -91,7 +95,30 @@ class DriveNode:
 
     def get(self, item: DriveObject) -> float:
         """Return the number in an object."""
+        item = self.typed(item)
         return item.decode(self.sdo.read(item.index, item.sub, size=item.size))
+
+    def typed(self, item: DriveObject) -> DriveObject:
+        """Return an object in the width in which :meth:`held` found it."""
+        return item.of_length(self._lengths.get((item.index, item.sub), item.size)) or item
+
+    def held(self, item: DriveObject) -> float | None:
+        """Return the number in an object, None where the drive has none that can be read.
+
+        A whole number may have another width than the standard's: makers keep 0x6075 in 16 bits and 0x6071 in 32. From
+        now on it is read, written and mapped in its own.
+        """
+        try:
+            data = self.sdo.read(item.index, item.sub)
+        except SdoAbort as abort:
+            if abort.code in NOT_READ:
+                return None
+            raise
+        found = item.of_length(len(data))
+        if found is None:
+            return None
+        self._lengths[item.index, item.sub] = len(data)
+        return found.decode(data)
 
     def whole(self, item: DriveObject) -> int:
         """Return the whole number in an object."""
@@ -99,7 +126,7 @@ class DriveNode:
 
     def put(self, item: DriveObject, value: float) -> None:
         """Write a number; where the answer is lost it is read back."""
-        self.write_bytes(item.index, item.sub, item.encode(value))
+        self.write_bytes(item.index, item.sub, self.typed(item).encode(value))
 
     def command(self, item: DriveObject, value: int, *, retry: Retry = Retry.REPEAT) -> None:
         """Write a command: nothing a restore would have to bring back."""

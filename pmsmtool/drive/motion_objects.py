@@ -13,7 +13,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
@@ -55,8 +54,6 @@ TORQUE_SLOPE = DriveObject(0x6087, 0, "I")
 SLOW_SLOPE_S = 0.5
 """Time to the rated torque from which a slope of the drive's own leaves nothing of a push: the shortest lasts 40 ms. As
 stored, one maker's drive takes 10 s; others take no time (0), or 0.1 ms."""
-_ABSENT = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY)
-"""What cannot be read back proves nothing, and counts as missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,17 +100,6 @@ class LimitedSpeed:
     mode: int
 
 
-def held(node: DriveNode, item: DriveObject) -> float | None:
-    """Return the number in an object, None where the drive has none, or another type: it could not be written."""
-    try:
-        data = node.sdo.read(item.index, item.sub)
-    except SdoAbort as abort:
-        if abort.code in _ABSENT:
-            return None
-        raise
-    return item.decode(data) if len(data) == item.size else None
-
-
 def _own(node: DriveNode, name: str) -> Quantity | None:
     """Return the maker's own object of the map; a fixed number is none."""
     row: MotionObject | None = node.map.motion.get(name)
@@ -124,7 +110,7 @@ def _own(node: DriveNode, name: str) -> Quantity | None:
 
 def rated_current(node: DriveNode) -> Quantity | None:
     """Return where the rated current stands; None where nobody knows."""
-    if held(node, objects.RATED_CURRENT_MA) is not None:
+    if node.held(objects.RATED_CURRENT_MA) is not None:
         return Quantity(objects.RATED_CURRENT_MA, RATED_RMS)
     return _own(node, "rated_current")
 
@@ -137,14 +123,14 @@ def rated_apk(node: DriveNode) -> float:
     NotAvailable
         The drive does not say.
     """
-    found = held(node, objects.RATED_CURRENT_MA)
+    found = node.held(objects.RATED_CURRENT_MA)
     if found is not None:
         return RATED_RMS * found
     row = node.map.motion.get("rated_current")
     if row is not None and row.number:  # no object holds it: its owner wrote it into the map
         return row.per_count * row.number
     own = _own(node, "rated_current")
-    found = None if own is None else held(node, own.item)
+    found = None if own is None else node.held(own.item)
     if own is None or found is None:
         raise NotAvailable(
             f"the drive does not report {NO_RATED}", where=f"node {node.node}",
@@ -162,14 +148,14 @@ def shown_current(node: DriveNode, rated: float) -> Quantity:
         The drive shows neither.
     """
     own = _own(node, "current")
-    if own is not None and held(node, own.item) is not None:
+    if own is not None and node.held(own.item) is not None:
         return own
-    if held(node, objects.CURRENT_PERMILLE) is not None:
+    if node.held(objects.CURRENT_PERMILLE) is not None:
         return Quantity(objects.CURRENT_PERMILLE, 1e-3 * rated)
     signal = node.map.signals.get("i_q_a")
     if signal is not None and not wire_unit(signal.unit).relative_to:
         return Quantity(DriveObject(signal.index, signal.sub, LETTERS[signal.wire]), wire_unit(signal.unit).scale)
-    if held(node, TORQUE_PERMILLE) is not None:
+    if node.held(TORQUE_PERMILLE) is not None:
         return Quantity(TORQUE_PERMILLE, 1e-3 * rated)
     raise NotAvailable("the drive shows neither current (0x6078) nor torque (0x6077)", where=f"node {node.node}")
 
@@ -193,14 +179,14 @@ def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
     NotAvailable
         The drive has no such mode, or no target in it.
     """
-    modes = int(held(node, objects.SUPPORTED_MODES) or 0)
-    if node.map.capabilities.torque_mode and held(node, objects.TARGET_TORQUE_PERMILLE) is not None:
+    modes = int(node.held(objects.SUPPORTED_MODES) or 0)
+    if node.map.capabilities.torque_mode and node.held(objects.TARGET_TORQUE_PERMILLE) is not None:
         order = (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE)
         for mode in reversed(order) if slow_slope_s(node) else order:
             if modes >> mode - 1 & 1:
                 return TorqueTarget(Quantity(objects.TARGET_TORQUE_PERMILLE, 1e-3 * rated), mode)
     own = _own(node, "target_current")
-    if own is not None and held(node, own.item) is not None:
+    if own is not None and node.held(own.item) is not None:
         return TorqueTarget(own, node.map.motion["target_current"].mode)
     raise NotAvailable(
         f"the drive has no torque mode that pmsmtool supports (0x6502 = {modes:#x})", where=f"node {node.node}"
@@ -212,19 +198,19 @@ def cyclic_period_s(node: DriveNode, wanted_s: float) -> float:
 
     A drive fills a longer time than the targets really take by going from one to the next: it would follow late.
     """
-    if held(node, PERIOD_VALUE) is None:
+    if node.held(PERIOD_VALUE) is None:
         return wanted_s
     for item, number in ((PERIOD_EXPONENT, -3), (PERIOD_VALUE, round(1e3 * wanted_s))):
         with contextlib.suppress(SdoAbort):
             if node.get(item) != number:
                 node.put(item, number)
-    exponent = held(node, PERIOD_EXPONENT)
+    exponent = node.held(PERIOD_EXPONENT)
     return node.get(PERIOD_VALUE) * 10.0 ** (-3 if exponent is None else exponent)
 
 
 def slow_slope_s(node: DriveNode) -> float:
     """Return the time (s) that the drive's slope takes to its rated torque where it is too long for a push, else 0."""
-    slope = held(node, TORQUE_SLOPE) or math.inf  # permille per second; 0 is none
+    slope = node.held(TORQUE_SLOPE) or math.inf  # permille per second; 0 is none
     return 1000.0 / slope if 1000.0 / slope > SLOW_SLOPE_S else 0.0
 
 
@@ -238,8 +224,8 @@ def limited_speed(node: DriveNode) -> LimitedSpeed:
     """
     own, row = _own(node, "target_speed"), node.map.motion.get("target_speed")
     limit = _own(node, "current_limit")  # the one that its map names: what it does in this mode is the maker's matter
-    modes = int(held(node, objects.SUPPORTED_MODES) or 0)
-    there = own is not None and limit is not None and None not in (held(node, own.item), held(node, limit.item))
+    modes = int(node.held(objects.SUPPORTED_MODES) or 0)
+    there = own is not None and limit is not None and None not in (node.held(own.item), node.held(limit.item))
     if own is None or row is None or limit is None or not there or not modes >> row.mode - 1 & 1:
         raise NotAvailable(
             f"the drive has neither a torque mode nor a velocity mode whose unit its map states (0x6502 = {modes:#x})",
@@ -268,23 +254,23 @@ def position_units(node: DriveNode) -> float:
 
 
 def _position_units(node: DriveNode) -> float:
-    sign = -1.0 if int(held(node, POLARITY) or 0) & POSITION_TURNED else 1.0
-    gear = max(1.0, held(node, GEAR_MOTOR) or 1.0) / max(1.0, held(node, GEAR_SHAFT) or 1.0)
-    unit = int(held(node, POSITION_UNIT) or 0)
+    sign = -1.0 if int(node.held(POLARITY) or 0) & POSITION_TURNED else 1.0
+    gear = max(1.0, node.held(GEAR_MOTOR) or 1.0) / max(1.0, node.held(GEAR_SHAFT) or 1.0)
+    unit = int(node.held(POSITION_UNIT) or 0)
     if unit >> 16 & 0xFF == DEGREE:
         exponent = unit >> 24
         return sign * 360.0 / 10.0 ** (exponent - 256 if exponent > 127 else exponent) / gear
-    feed = held(node, FEED) or 1.0
+    feed = node.held(FEED) or 1.0
     if feed > 1.0:
-        return sign * feed / max(1.0, held(node, FEED_TURNS) or 1.0) / gear
+        return sign * feed / max(1.0, node.held(FEED_TURNS) or 1.0) / gear
     if gear != 1.0:
         raise NotAvailable(
             f"a gear of {gear:.4g} is set (0x6091), and the position may be of the motor or behind it",
             where=f"node {node.node}, 0x6091", hint="set it to 1:1, or the feed (0x6092), with the maker's software",
         )  # fmt: skip
-    counts = held(node, ENCODER_COUNTS)
+    counts = node.held(ENCODER_COUNTS)
     if counts is not None:
-        return sign * counts / max(1.0, held(node, MOTOR_TURNS) or 1.0)
+        return sign * counts / max(1.0, node.held(MOTOR_TURNS) or 1.0)
     row = node.map.motion.get("counts_per_turn")
     if row is None:
         raise NotAvailable(f"the drive does not report {NO_COUNTS}", where=f"node {node.node}")
@@ -325,7 +311,7 @@ def lowered_trip(held_rpm: float, speed_max_rpm: float) -> float:
 def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, float] | None:
     """Return the first limit that the drive has, and what it now allows (A peak or rpm)."""
     for limit in limits:
-        found = held(node, limit.item)
+        found = node.held(limit.item)
         if found is not None:
             return limit, limit.per_count * found
     return None
@@ -346,7 +332,7 @@ def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
         )
     slope_s = slow_slope_s(node)
     if slope_s:
-        cyclic = bool(int(held(node, objects.SUPPORTED_MODES) or 0) >> Mode.CYCLIC_TORQUE - 1 & 1)
+        cyclic = bool(int(node.held(objects.SUPPORTED_MODES) or 0) >> Mode.CYCLIC_TORQUE - 1 & 1)
         told = "mode 10 ignores it, and this program ramps" if cyclic else "torque pulses are slow, or impossible"
         lines.append(f"slope     {slope_s:.3g} s to the rated torque in mode 4 (0x6087): {told}")
     return lines

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+WHOLE_LETTERS = {1: "b", 2: "h", 4: "i", 8: "q"}
+"""``struct`` letters of the integers of CiA 301 by their bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +47,13 @@ class DriveObject:
     def decode(self, data: bytes) -> float:
         """Return the value of the object's bytes."""
         return float(struct.unpack("<" + self.letter, data)[0])
+
+    def of_length(self, length: int) -> DriveObject | None:
+        """Return the object as a drive has it that keeps the same whole number in so many bytes; None: it cannot be."""
+        letter = WHOLE_LETTERS.get(length) if self.letter in "bBhHiIqQ" else None
+        if length == self.size:
+            return self
+        return None if letter is None else replace(self, letter=letter if self.letter.islower() else letter.upper())
 
 
 DEVICE_TYPE = DriveObject(0x1000, 0, "I")

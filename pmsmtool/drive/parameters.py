@@ -14,7 +14,7 @@ from enum import IntEnum
 
 from pmsmtool.bus.sdo import Mode, Retry
 from pmsmtool.drive import objects
-from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.drive_node import NOT_READ, DriveNode
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.map_tables import look_up_words
 from pmsmtool.errors import BusError, DriveFault, DriveTimeout, NotAvailable, SdoAbort, VerifyMismatch
@@ -94,6 +94,23 @@ class DriveParameters:
         cell = self.map.cells[name]
         values = {cell.gain: self.read_value(cell.gain)} if cell.gain else {}
         return cell.decode(self.read([name])[name], values)
+
+    def held_value(self, name: str) -> float | None:
+        """Return one parameter in SI; None where map or drive have no object for it, or the drive has another type.
+
+        What the standard or a family has, a drive may lack: a row of a map is no promise.
+        """
+        cell = self.map.cells.get(name)
+        gain = self.held_value(cell.gain) if cell is not None and cell.gain else None
+        if cell is None or (cell.gain and gain is None):
+            return None
+        try:
+            data = self.node.sdo.read(cell.index, cell.sub)
+        except SdoAbort as abort:
+            if abort.code in NOT_READ:
+                return None
+            raise
+        return cell.decode(data, {} if gain is None else {cell.gain: gain}) if len(data) == cell.size else None
 
     def check_layout(self) -> None:
         """Refuse a drive whose parameter set this program does not know.

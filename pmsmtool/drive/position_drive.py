@@ -15,7 +15,7 @@ import numpy as np
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
-from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits, held
+from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits
 from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.drive.set_point import POSITION_DEMAND, TARGET_POSITION, WHOLE, start_move
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S
@@ -55,13 +55,13 @@ class PositionDrive(TorqueDrive):
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)
-        modes = int(held(self.node, objects.SUPPORTED_MODES) or 0)
+        modes = int(self.node.held(objects.SUPPORTED_MODES) or 0)
         lacking = [
             what
             for what, has in (
                 ("profile position mode (bit 0 of 0x6502)", modes & 1),
-                ("a target position (0x607A)", held(self.node, TARGET_POSITION) is not None),
-                ("its position demand (0x6062)", held(self.node, POSITION_DEMAND) is not None),
+                ("a target position (0x607A)", self.node.held(TARGET_POSITION) is not None),
+                ("its position demand (0x6062)", self.node.held(POSITION_DEMAND) is not None),
             )
             if not has
         ]

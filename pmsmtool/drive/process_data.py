@@ -83,6 +83,7 @@ def live_values(
     NotAvailable
         More quantities than the borrowed PDOs hold, or a drive without them.
     """
+    objects = {name: node.typed(objects[name]) for name in names}
     groups = _groups(names, objects)
     live = LiveValues(objects)
     before: list[BorrowedPdo] = []

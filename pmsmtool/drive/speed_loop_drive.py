@@ -18,7 +18,7 @@ import numpy as np
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
-from pmsmtool.drive.motion_objects import POSITION, TORQUE_PERMILLE, allowed, current_limits, held, rated_current
+from pmsmtool.drive.motion_objects import POSITION, TORQUE_PERMILLE, allowed, current_limits, rated_current
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S
@@ -101,9 +101,9 @@ class SpeedLoopDrive(TorqueDrive):
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)
-        modes = int(held(self.node, objects.SUPPORTED_MODES) or 0)
+        modes = int(self.node.held(objects.SUPPORTED_MODES) or 0)
         offered = [mode for mode in (Mode.CYCLIC_VELOCITY, Mode.PROFILE_VELOCITY) if modes >> mode - 1 & 1]
-        if not offered or held(self.node, objects.TARGET_VELOCITY_MRPM) is None:
+        if not offered or self.node.held(objects.TARGET_VELOCITY_MRPM) is None:
             raise NotAvailable(
                 f"the drive has no velocity mode (0x6502 = {modes:#x}, 0x60FF)", where=f"node {node_id}",
                 hint="`pmsmtool caps` lists what this drive can measure",
@@ -113,7 +113,7 @@ class SpeedLoopDrive(TorqueDrive):
         limits = list(current_limits(self.node, self._rated_apk))
         # the drive's own limit bounds whatever its loop asks for
         self.commands_bounded_current = allowed(self.node, iter(limits)) is not None
-        allows = [limit.per_count * value for limit in limits if (value := held(self.node, limit.item)) is not None]
+        allows = [limit.per_count * value for limit in limits if (value := self.node.held(limit.item)) is not None]
         self.current_limit_apk = min(allows, default=math.inf)
         base = rated_current(self.node)
         of_standard = base is not None and base.item == objects.RATED_CURRENT_MA

@@ -223,12 +223,7 @@ def envelope_of(drive: CanopenDrive, request: IdentifyRequest, known: MachineFil
         held = allowed(node, iter((limit,)))
         rated = rated if held is None else min(rated, held[1] / HEADROOM)
     speed = allowed(node, speed_limits(node))
-    if speed is not None:
-        rpm = speed[1]
-    elif "motor.n_max_rpm" in node.map.cells:
-        rpm = drive.parameters.read_value("motor.n_max_rpm")
-    else:
-        rpm = UNLIMITED_RPM
+    rpm = (drive.parameters.held_value("motor.n_max_rpm") or UNLIMITED_RPM) if speed is None else speed[1]
     if known is not None:
         rated = min(rated, known.machine.I_nom_apk or math.inf)
         rpm = min(rpm, known.machine.n_max_rpm or math.inf)
@@ -375,6 +370,4 @@ def _given_pole_pairs(task: Task) -> int:
     """Return the pole pairs as given, else as the maker's set-up left them in the drive; 0 when neither has them."""
     if task.machine is not None:
         return task.machine.machine.pole_pairs
-    if "motor.pole_pairs" in task.drive.node.map.cells:
-        return round(task.drive.parameters.read_value("motor.pole_pairs"))
-    return 0
+    return round(task.drive.parameters.held_value("motor.pole_pairs") or 0.0)

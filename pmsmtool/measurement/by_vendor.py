@@ -69,7 +69,8 @@ def identify_vendor(
 def _set_values(drive: VendorDrive) -> dict[str, float]:
     """Return what results are counted relative to, as the drive is set, until it tells better."""
     needed = {cell.gain for cell in drive.tuning.results.values() if cell.gain}
-    return {name: drive.parameters.read_value(name) for name in needed if name in drive.node.map.cells}
+    held = {name: drive.parameters.held_value(name) for name in needed}
+    return {name: value for name, value in held.items() if value is not None}
 
 
 def plan(task: Task) -> tuple[Envelope, list[str]]:

@@ -411,10 +411,7 @@ def _bit(mode: Mode) -> int:
 
 
 def _modes(node: DriveNode) -> int:
-    try:
-        return node.whole(SUPPORTED_MODES)
-    except SdoAbort:
-        return 0
+    return int(node.held(SUPPORTED_MODES) or 0)
 
 
 def reference_capabilities(identity: Identity) -> Capabilities:

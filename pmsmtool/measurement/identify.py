@@ -230,12 +230,10 @@ def identify_after_drive(
 def _wrong_set_up(drive: CanopenDrive, own: Stage) -> str:
     """Return why a drive must not be pushed by torque: it commutates by pole pairs that are not the machine's."""
     told = next((round(float(value["value"])) for value in own.values if value["name"] == "pole_pairs"), None)
-    if told is None or "motor.pole_pairs" not in drive.node.map.cells:
+    held = drive.parameters.held_value("motor.pole_pairs")
+    if told is None or held is None or round(held) == told:
         return ""
-    held = round(drive.parameters.read_value("motor.pole_pairs"))
-    if held == told:
-        return ""
-    return f"torque pulses: not available: the drive is set to {held} pole pairs and measures {told}; set it up first"
+    return f"torque pulses: not available: the drive is set to {held:.0f} pole pairs, measures {told}; set it up first"
 
 
 def _joined(run: RunDirectory, own: Stage, rest: Stage, known: Known | None) -> Stage:

@@ -16,7 +16,7 @@ import numpy as np
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope, largest_acceleration
 from pmsmtool.drive.guard import WATCH_S, GuardedDrive, guarded
-from pmsmtool.drive.motion_objects import allowed, held, speed_limits
+from pmsmtool.drive.motion_objects import allowed, speed_limits
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
@@ -144,7 +144,7 @@ def refuse_unsafe(node: DriveNode, envelope: Envelope) -> None:
             where=f"node {node.node}", hint="uncouple the machine, then give --shaft free",
         )  # fmt: skip
     for sub in (1, 2, 3):
-        word = held(node, DriveObject(0x1010, sub, "I"))
+        word = node.held(DriveObject(0x1010, sub, "I"))
         if word is not None and int(word) & 2:
             raise SafetyRefusal(
                 "the drive stores parameters by itself: a changed gain would survive", hint="learn it on another drive",

@@ -23,27 +23,23 @@ class Node:
     """Objects by address; what is ``fixed`` takes no write, and others do not exist."""
 
     def __init__(self, held: dict[DriveObject, float], fixed: tuple[DriveObject, ...] = ()) -> None:
-        self.held, self.fixed = held, fixed
+        self.objects, self.fixed = held, fixed
         self.node = 1
-        self.sdo = self
         self.puts: list[tuple[DriveObject, float]] = []
 
     def get(self, item: DriveObject) -> float:
-        if item not in self.held:
+        if item not in self.objects:
             raise SdoAbort(AbortCode.NO_OBJECT, item.index, item.sub, "no such object")
-        return self.held[item]
+        return self.objects[item]
 
-    def read(self, index: int, sub: int) -> bytes:
-        item = next(
-            (each for each in self.held if (each.index, each.sub) == (index, sub)), DriveObject(index, sub, "B")
-        )
-        return item.encode(self.get(item))
+    def held(self, item: DriveObject) -> float | None:
+        return self.objects.get(item)
 
     def put(self, item: DriveObject, value: float) -> None:
-        if item in self.fixed or item not in self.held:
+        if item in self.fixed or item not in self.objects:
             raise SdoAbort(AbortCode.READ_ONLY, item.index, item.sub, "cannot be written")
         self.puts.append((item, value))
-        self.held[item] = value
+        self.objects[item] = value
 
 
 @pytest.mark.parametrize(
@@ -93,7 +89,7 @@ def test_node_guarding_waits_as_long_as_the_heartbeat_would(monkeypatch: pytest.
             continue
         assert dead_man._set_guarding(drive, heartbeat) == bool(held)  # type: ignore[arg-type]
         if held:
-            assert node.held == {
+            assert node.objects == {
                 objects.LIFE_TIME_FACTOR: pytest.approx(5.0), objects.GUARD_TIME_MS: pytest.approx(50.0),
                 objects.PRODUCER_HEARTBEAT_MS: 0,
             }  # fmt: skip
@@ -110,7 +106,7 @@ def test_of_the_voltages_only_the_link_has_an_object_of_every_drives() -> None:
         drive.live("u_d_v")
     drive.node.map = SimpleNamespace(signals={"u_d_v": shown, "U_dc_v": shown})
     assert drive.live("u_d_v") == drive.live("U_dc_v") == pytest.approx(12.34)
-    drive.node.held.clear()  # type: ignore[attr-defined]
+    drive.node.objects.clear()  # type: ignore[attr-defined]
     with pytest.raises(NotAvailable, match="does not show U_dc_v"):
         drive.live("U_dc_v")
 

@@ -74,6 +74,18 @@ def faulhaber() -> tuple[Row, ...]:
     )  # fmt: skip
 
 
+def unknown(modes: str = "0x2D", *more: Row, without: tuple[int, ...] = ()) -> tuple[Row, ...]:
+    """A maker whom no map names: the objects of CiA 402 alone; rows of ``more`` stand for those of the same index."""
+    rows = (
+        *COMMON, *HEARTBEAT, *TORQUE, *identity(0x1DD, 0x10305070), (0x6007, 0, "I16", "rw", "2"),
+        (0x606C, 0, "I32", "ro", ""), (0x6073, 0, "U16", "rw", "1000"), (0x6075, 0, "U32", "rw", ""),
+        (0x6078, 0, "I16", "ro", ""), (0x6080, 0, "U32", "rw", ""), (0x608F, 1, "U32", "rw", "4096"),
+        (0x608F, 2, "U32", "rw", "1"), (0x60FF, 0, "I32", "rw", "0"), (0x6502, 0, "U32", "ro", modes),
+    )  # fmt: skip
+    gone = {*without, *(row[0] for row in more)}
+    return (*(row for row in rows if row[0] not in gone), *more)
+
+
 def write_eds(path: Path, rows: Iterable[Row], limits: dict[tuple[int, int], tuple[int, int]] | None = None) -> Path:
     """Write the rows as an EDS; limits by address."""
     lines = ["[FileInfo]", "FileName=x.eds", "[DeviceInfo]", "ProductName=drive of a test"]

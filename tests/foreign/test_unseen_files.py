@@ -16,7 +16,7 @@ from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.node.dictionary import Entry
 from tests.cli.conftest import Tool
-from tests.foreign.data_sheets import Row, copley, epos4, faulhaber, write_eds
+from tests.foreign.data_sheets import Row, copley, epos4, faulhaber, unknown, write_eds
 from tests.simulated_bus import settle
 
 SEEDS = 8
@@ -122,3 +122,29 @@ def test_a_position_that_cannot_be_read_moves_nothing(tmp_path: Path, tool: Tool
     channel = f"interior-2k2?nv=:memory:&eds={write_eds(tmp_path / 'x.eds', rows)}"
     code, _, said = tool("--sim", channel, "--yes", "check", str(machine_path("interior-2k2")))
     assert code == 9 and "position in increments" in said and "supervision tested" not in said
+
+
+def checked(tool: Tool, rows: tuple[Row, ...]) -> tuple[int, dict[str, str], str]:
+    """Return exit code, verdicts and words of `check` on a drive with these objects."""
+    channel = f"interior-2k2?nv=:memory:&eds={write_eds(Path('x.eds'), rows)}"
+    code, out, said = tool("--sim", channel, "--yes", "check", str(machine_path("interior-2k2")), "--json")
+    findings = json.loads(out)["findings"] if out.startswith("{") else ()
+    return code, {row["looked_at"]: row["verdict"] for row in findings}, said
+
+
+WIDTHS: tuple[Row, ...] = (
+    (0x6071, 0, "I32", "rw", "0"), (0x6073, 0, "U32", "rw", "1000"), (0x6075, 0, "U16", "rw", ""),
+    (0x6078, 0, "I32", "ro", ""), (0x6080, 0, "U16", "rw", ""), (0x6502, 0, "U16", "ro", "0x2D"),
+)  # fmt: skip
+
+
+@pytest.mark.chain
+def test_whole_numbers_of_another_width_are_taken_as_the_drive_has_them(tool: Tool) -> None:
+    code, verdicts, said = checked(tool, unknown("0x2D", *WIDTHS))
+    assert code == 10 and verdicts["shaft"] == verdicts["encoder sign"] == "ok", said
+
+
+@pytest.mark.chain
+def test_a_drive_that_no_map_names_needs_no_speed_limit_of_its_own(tool: Tool) -> None:
+    code, verdicts, said = checked(tool, unknown(without=(0x6080,)))
+    assert code == 10 and verdicts["shaft"] == "ok", said

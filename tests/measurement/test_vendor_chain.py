@@ -120,7 +120,7 @@ def test_measured_values_outrank_the_drives_own(tmp_path: Path) -> None:
 def test_a_drive_set_to_other_pole_pairs_is_not_pushed(tmp_path: Path) -> None:
     stage, _ = first_stage(tmp_path, load_family("synapticon"), set_up=4)
     assert stage.status == "pass"
-    assert any("is set to 4 pole pairs and measures 3" in line for line in stage.fallbacks)
+    assert any("is set to 4 pole pairs, measures 3" in line for line in stage.fallbacks)
     assert not any("std" in value for value in stage.values)
 
 
