@@ -36,8 +36,10 @@ PERIOD_VALUE, PERIOD_EXPONENT = DriveObject(0x60C2, 1, "B"), DriveObject(0x60C2,
 """Time between two targets of a cyclic mode, value times 10^exponent s (CiA 402-2, interpolation time period)."""
 POSITION_TURNED = 0x80
 """Bit of the polarity that turns position against torque (CiA 402-2, 0x607E)."""
-DEGREE = 0x41
-"""Numerator of an SI unit of position (CiA 303-2); others count increments."""
+TURN_IN = {0x10: 2.0 * math.pi, 0x41: 360.0, 0x42: 21_600.0, 0x43: 1_296_000.0, 0xB4: 1.0}
+"""A turn in radians, degrees, minutes and seconds of arc, and revolutions, by the unit's numerator (CiA 303-2)."""
+INCREMENTS = (0x00, 0xB5)
+"""Numerators of units of the encoder; others, as metres, say nothing of a turn without the feed (0x6092)."""
 RATED_RMS = 1e-3 * math.sqrt(2.0)
 """A peak per count of 0x6075, taken as mA rms: the larger of the two readings."""
 LEAST_UNITS = 24
@@ -257,12 +259,17 @@ def _position_units(node: DriveNode) -> float:
     sign = -1.0 if int(node.held(POLARITY) or 0) & POSITION_TURNED else 1.0
     gear = max(1.0, node.held(GEAR_MOTOR) or 1.0) / max(1.0, node.held(GEAR_SHAFT) or 1.0)
     unit = int(node.held(POSITION_UNIT) or 0)
-    if unit >> 16 & 0xFF == DEGREE:
-        exponent = unit >> 24
-        return sign * 360.0 / 10.0 ** (exponent - 256 if exponent > 127 else exponent) / gear
+    numerator, exponent = unit >> 16 & 0xFF, unit >> 24
+    if numerator in TURN_IN:
+        return sign * TURN_IN[numerator] / 10.0 ** (exponent - 256 if exponent > 127 else exponent) / gear
     feed = node.held(FEED) or 1.0
     if feed > 1.0:
         return sign * feed / max(1.0, node.held(FEED_TURNS) or 1.0) / gear
+    if numerator not in INCREMENTS:
+        raise NotAvailable(
+            f"the position is in a unit that says nothing of a turn (0x60A8 = {unit:#010x}), and no feed is set",
+            where=f"node {node.node}, 0x60A8", hint="set the feed (0x6092), or the unit, with the maker's software",
+        )  # fmt: skip
     if gear != 1.0:
         raise NotAvailable(
             f"a gear of {gear:.4g} is set (0x6091), and the position may be of the motor or behind it",

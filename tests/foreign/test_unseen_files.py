@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import random
 import re
 from collections.abc import Callable
@@ -12,11 +13,15 @@ from pathlib import Path
 import pytest
 
 from benchmarks.eds_nodes import entries_of, faults_of, mutated, text_of
+from pmsmtool.drive.motion_objects import position_units
+from pmsmtool.errors import NotAvailable
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.sim.foreign import laws
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.node.dictionary import Entry
 from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import Row, copley, epos4, faulhaber, unknown, write_eds
+from tests.foreign.test_foreign_drive import opened
 from tests.simulated_bus import settle
 
 SEEDS = 8
@@ -148,3 +153,28 @@ def test_whole_numbers_of_another_width_are_taken_as_the_drive_has_them(tool: To
 def test_a_drive_that_no_map_names_needs_no_speed_limit_of_its_own(tool: Tool) -> None:
     code, verdicts, said = checked(tool, unknown(without=(0x6080,)))
     assert code == 10 and verdicts["shaft"] == "ok", said
+
+
+TURN = {0xFDB40000: 1000.0, 0xFD100000: 2000.0 * math.pi, 0xFF410000: 3600.0, 0x00420000: 21600.0, 0x00B50000: 131072.0}
+"""Units of position per turn by 0x60A8 (CiA 303-2): thousandths of a turn, milliradians, tenths of a degree, minutes of
+arc, increments of the machine's encoder."""
+
+
+@pytest.mark.parametrize("word", TURN)
+@pytest.mark.parametrize("polarity", ["0", "0x80"])
+def test_the_unit_of_position_is_the_one_that_the_drive_states(tmp_path: Path, word: int, polarity: str) -> None:
+    rows = unknown("0x2D", (0x60A8, 0, "U32", "rw", hex(word)), (0x607E, 0, "U8", "rw", polarity))
+    path = write_eds(tmp_path / "x.eds", rows)
+    assert laws.position_units(read_makers_objects(str(path)), 131072) == pytest.approx(TURN[word])
+    with opened(path) as node:
+        assert position_units(node) == pytest.approx(TURN[word] * (-1.0 if polarity == "0x80" else 1.0))
+
+
+def test_a_length_says_nothing_of_a_turn_without_a_feed(tmp_path: Path) -> None:
+    metre = (0x60A8, 0, "U32", "rw", "0xFD010000")
+    with opened(write_eds(tmp_path / "x.eds", unknown("0x2D", metre))) as node, pytest.raises(NotAvailable) as refused:
+        position_units(node)
+    assert "0xfd010000" in str(refused.value) and "0x6092" in str(refused.value)
+    feed = ((0x6092, 1, "U32", "rw", "6000"), (0x6092, 2, "U32", "rw", "1"))
+    with opened(write_eds(tmp_path / "y.eds", unknown("0x2D", metre, *feed))) as node:
+        assert position_units(node) == 6000.0

@@ -48,6 +48,8 @@ class Law:
 
 TENTH_OF_DEGREE, RPM, RPS = 0xFF41, 0xB447, 0xB403
 _DEGREE, _REVOLUTION, _MINUTE, _SECOND = 0x41, 0xB4, 0x47, 0x03
+_ANGLES = {0x10: 2.0 * math.pi, _DEGREE: 360.0, 0x42: 360.0 * 60.0, 0x43: 360.0 * 3600.0, _REVOLUTION: 1.0}
+"""Units of an angle per turn, by CiA 303-2: radian, degree, minute and second of arc, revolution."""
 DECIMAL_PREFIX = {0x00: 0, 0xFF: -1, 0xFE: -2, 0xFD: -3, 0xFC: -4, 0xFB: -5, 0xFA: -6, 0x01: 1, 0x02: 2, 0x03: 3}
 
 
@@ -60,10 +62,10 @@ def _unit(word: int) -> tuple[float, int, int]:
 def position_units(objects: MakersObjects, counts: int) -> float:
     """Return the units of 0x6064 per turn of the motor."""
     factor, numerator, _ = _unit(objects.stored(0x60A8))
-    if numerator == _DEGREE:
-        return 360.0 / factor
-    feed, shaft = objects.stored(0x6092, 1), max(1, objects.stored(0x6092, 2))
     gear = max(1, objects.stored(0x6091, 1)) / max(1, objects.stored(0x6091, 2))
+    if numerator in _ANGLES:
+        return _ANGLES[numerator] / factor / gear
+    feed, shaft = objects.stored(0x6092, 1), max(1, objects.stored(0x6092, 2))
     if feed > 1:
         return feed / shaft / gear
     return encoder_resolution(objects, counts) / max(1, objects.stored(0x608F, 2))
