@@ -44,6 +44,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
     from pmsmtool.flash.map_gate import contradictions, other_drive, unknown_firmware
     from pmsmtool.measurement.capabilities import examine
     from pmsmtool.params.catalogue import BY_NAME
+    from pmsmtool.sim.foreign.drive import assumptions_of
 
     given = None if map_file is None else read_map(map_file)
     if eds is not None:
@@ -58,6 +59,8 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
             out.detail(f"not written: {name}: {why}")
     if eds is not None:
         out.note(f"no drive was asked: this is what the objects of {eds} allow once a motor is set up")
+        for line in assumptions_of(eds):
+            out.warn(f"{eds}: {line}")
     if given is not None and given.name != GENERIC and not found.map_is_drives:
         differ = other_drive(given, found.identity.vendor, found.identity.product, found.identity.doubt)
         out.warn(f"{differ}: what is listed is that map's, and nothing is written or moved through it")

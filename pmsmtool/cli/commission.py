@@ -126,13 +126,13 @@ def commission_command(
     from pmsmtool.flash.map_gate import forget_map
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.run_directory import RunDirectory
-    from pmsmtool.sim.foreign.drive import unheld_of
+    from pmsmtool.sim.foreign.drive import assumptions_of
 
     if rehearse is not None or eds is not None:
         if resume is not None:
             raise click.UsageError("--resume goes on with the drive of its run: not together with --rehearse or --eds")
         bus = rehearsal_bus(bus, eds=eds, family=rehearse, machine=machine)
-        for line in unheld_of(eds, load_machine_file(machine)) if eds is not None and machine is not None else ():
+        for line in assumptions_of(eds, load_machine_file(machine)) if eds is not None and machine is not None else ():
             out.warn(f"{eds}: {line}")
     if accept and motion.yes:
         raise click.UsageError("--accept-contradiction needs a person at the terminal: not together with --yes")

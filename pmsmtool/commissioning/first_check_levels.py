@@ -144,6 +144,12 @@ def check_below_full(
             rows = [row for row in rows if row.looked_at not in {each.looked_at for each in judged}] + judged
         except IdentificationError as error:
             rows.append(Finding("shaft", WRONG, error.what, error.likely + "; an open phase; the encoder's sign"))
+        except NotAvailable as refused:  # mode 11: announced in 0x6502, and refused when it is asked for
+            if not turns:
+                raise
+            say(f"{refused.what}: torque pulses instead")
+            lacking = replace(found, features=found.features - {"commutation angle"})
+            return check_below_full(drive, lacking, stated, replace(envelope, travel_rad=math.pi), say)
         except SdoAbort:
             raise  # a refused object is no wiring
         except DriveFault as error:  # the guard has stopped the machine

@@ -123,6 +123,14 @@ def contradictions(node: DriveNode, names: Iterable[str]) -> dict[str, str]:
 def _other_drive(drive_map: DriveMap, identity: Identity) -> ConfigError:
     """Return the refusal, with what leads on."""
     vendor, product = identity.vendor, identity.product
+    if drive_map.staging and family_of(vendor, product) is None:  # nobody gave it: it is the default
+        return ConfigError(
+            f"no map names this drive: vendor {vendor:#010x} product {product:#x}",
+            where=_where(identity),
+            likely="a drive whose gains stand in no shipped map",
+            hint="write a map with the rows that its manual documents, and give it with --map; nothing was moved or "
+            "written",
+        )
     if identity.doubt:
         hint = "if it is one after all, give --map with a copy of the map whose [identity] names it"
     elif drive_map.vendor == vendor == UNKNOWN_VENDOR:

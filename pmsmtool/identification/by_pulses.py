@@ -105,6 +105,8 @@ class PulseFacts:
         Whether no source says if the drive's amperes are peak or rms; they were read as rms.
     limit : str
         What is said of a current limit that was not proven.
+    no_vector : str
+        Why no vector was turned, where the drive announces that it can be.
     """
 
     kind: Method
@@ -120,6 +122,7 @@ class PulseFacts:
     traces: tuple[str, ...] = ()
     current_undecided: bool = False
     limit: str = ""
+    no_vector: str = ""
 
 
 def pulse_result(
@@ -175,7 +178,7 @@ def pulse_result(
         pushed, missing = _by_torque(traces, replace(facts, pole_pairs=pole_pairs), tolerance, inverter, psi_f_wb)
         estimates |= pushed
         missing = {name: why for name, why in missing.items() if name not in estimates}
-    return PulseResult(estimates, missing)
+    return PulseResult(estimates, missing | ({"offset_rad": facts.no_vector} if facts.no_vector else {}))
 
 
 def _by_recorder(

@@ -333,13 +333,16 @@ def measure_polled(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Puls
         try:
             turn_both_ways(drive, envelope, keep, say)
         except NotAvailable as refused:  # announced in 0x6502, and refused when it is asked for
-            refused.hint = "ask for the other quantities alone: `pmsmtool identify psi mechanics`"
-            raise
+            if not asked & {"psi", "mechanics"}:
+                raise
+            turns, facts = False, replace(facts, no_vector=f"{refused.what}, which 0x6502 announces")
+            say(f"pole pairs, direction, offset: not available: {facts.no_vector}")
     told = {"psi", "mechanics"} if turns or facts.pole_pairs else {"mechanics"}
     if asked & told and found.row("mechanics", Method.STANDARD).available:
         pushing = pushing_drive(drive.node.connection, drive.node.node, found.drive_map)
         try:
-            facts = replace(push_by_torque(pushing, envelope, keep, say), pole_pairs=facts.pole_pairs)
+            pushed = push_by_torque(pushing, envelope, keep, say)
+            facts = replace(pushed, pole_pairs=facts.pole_pairs, no_vector=facts.no_vector)
         finally:
             drive.may_be_energised = drive.may_be_energised or pushing.may_be_energised
             pushing.close()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.drive_node import NOT_READ, DriveNode
 from pmsmtool.drive.envelope import Envelope, largest_acceleration
 from pmsmtool.drive.guard import WATCH_S, GuardedDrive, guarded
 from pmsmtool.drive.motion_objects import allowed, speed_limits
@@ -95,13 +95,20 @@ def gain_object(node: DriveNode, name: str, index: int, sub: int, wire: str | No
     Raises
     ------
     NotAvailable
-        It is no whole number of up to 32 bits, or too small to be changed by a known ratio.
-    SdoAbort
-        The drive has no such object.
+        The drive has no such object, or it is no whole number of up to 32 bits, or too small to be changed by a known
+        ratio.
     """
-    data = node.sdo.read(index, sub)
-    letter = wire or {1: "B", 2: "H", 4: "I"}.get(len(data), "")
     where = f"node {node.node}, 0x{index:04X}:{sub:02X}"
+    try:
+        data = node.sdo.read(index, sub)
+    except SdoAbort as abort:
+        if abort.code not in NOT_READ:
+            raise
+        raise NotAvailable(
+            f"{name}: the drive has no such object", where=where,
+            hint=f"name the one that its manual calls this gain: `pmsmtool map learn {name}=0xINDEX:SUB`",
+        ) from abort  # fmt: skip
+    letter = wire or {1: "B", 2: "H", 4: "I"}.get(len(data), "")
     if not letter or letter == "f" or DriveObject(index, sub, letter).size != len(data):
         raise NotAvailable(f"{name}: {len(data)} bytes are no whole number that this program changes", where=where)
     item = DriveObject(index, sub, letter)

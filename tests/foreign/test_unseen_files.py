@@ -178,3 +178,64 @@ def test_a_length_says_nothing_of_a_turn_without_a_feed(tmp_path: Path) -> None:
     feed = ((0x6092, 1, "U32", "rw", "6000"), (0x6092, 2, "U32", "rw", "1"))
     with opened(write_eds(tmp_path / "y.eds", unknown("0x2D", metre, *feed))) as node:
         assert position_units(node) == 6000.0
+
+
+NO_MODE_11 = {(0x6060, 0): (-128, 10)}
+"""One maker's file: 0x6502 announces mode 11 (bit 10), 0x60EA is there, and 0x6060 takes 10 at the most."""
+
+
+def vector_drive() -> str:
+    rows = unknown("0x42D", (0x60EA, 0, "U16", "rw", "0"))
+    return f"interior-2k2?nv=:memory:&eds={write_eds(Path('x.eds'), rows, NO_MODE_11)}"
+
+
+@pytest.mark.chain
+def test_a_mode_that_is_announced_and_refused_ends_no_check(tool: Tool) -> None:
+    code, out, said = tool("--sim", vector_drive(), "--yes", "check", str(machine_path("interior-2k2")), "--json")
+    assert code == 10 and "torque pulses instead" in said
+    rows = {row["looked_at"]: row for row in json.loads(out)["findings"]}
+    assert rows["shaft"]["verdict"] == "ok" and "torque forth and back" in str(rows["shaft"])
+
+
+@pytest.mark.chain
+def test_a_mode_that_is_announced_and_refused_costs_its_own_quantities_alone(tool: Tool) -> None:
+    code, out, said = tool("--sim", vector_drive(), "--yes", "identify", "--json")
+    facts = json.loads(out)
+    assert code == 10 and "J_per_kt" in {row["name"] for row in facts["values"]}, said
+    assert "(11), which 0x6502 announces" in facts["refused"]["poles"] and "encoder" in facts["refused"]
+    code, _, said = tool("--sim", vector_drive(), "--yes", "identify", "poles")
+    assert code == 9 and "no mode of operation" in said
+
+
+def test_modes_that_a_file_leaves_blank_are_assumed_by_its_objects_and_said(tool: Tool) -> None:
+    write_eds(Path("x.eds"), unknown(""))
+    code, out, said = tool("caps", "--eds", "x.eds", "--json")
+    assert code == 0 and json.loads(out)["level"] == "standard"
+    assert "0x6502 is blank: modes 3, 4 are assumed" in said
+    write_eds(Path("y.eds"), unknown("0x2D"))
+    assert "0x6502" not in tool("caps", "--eds", "y.eds")[2]
+
+
+def test_a_file_without_control_and_status_word_is_no_drives(tool: Tool) -> None:
+    master = [row for row in unknown("") if row[0] not in (0x6040, 0x6041, 0x1000)]
+    write_eds(Path("x.eds"), [*master, (0x1000, 0, "U32", "ro", "0")])
+    code, _, said = tool("caps", "--eds", "x.eds")
+    assert code == 2 and "without control and status word" in said
+
+
+def test_a_maker_whom_no_map_names_is_not_told_of_another_map(tool: Tool) -> None:
+    write_eds(Path("x.eds"), unknown())
+    write_eds(Path("known.eds"), epos4())
+    assert tool("tune", str(machine_path("interior-2k2")), "-o", "design.toml")[0] == 0
+    code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes", "flash-params", "design.toml")
+    assert code == 2 and "no map names this drive: vendor 0x000001dd" in said and "pmsmsim" not in said
+    code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=known.eds", "--yes", "flash-params", "design.toml")
+    assert code == 2 and "add --map epos4" in said
+
+
+def test_a_gain_that_the_drive_lacks_is_asked_for_by_its_address(tool: Tool) -> None:
+    write_eds(Path("x.eds"), unknown())
+    profile = str(machine_path("interior-2k2"))
+    channel = "interior-2k2?nv=:memory:&eds=x.eds"
+    code, _, said = tool("--sim", channel, "--yes", "map", "learn", "--machine", profile)
+    assert code == 9 and "the drive has no such object" in said and "=0xINDEX:SUB" in said

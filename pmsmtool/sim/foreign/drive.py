@@ -18,7 +18,7 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.errors import ConfigError
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
-from pmsmtool.sim.foreign.families import family_of, laws_of, modes_of, units_of
+from pmsmtool.sim.foreign.families import assumed_modes, family_of, laws_of, modes_of, units_of
 from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects, read_makers_objects
 from pmsmtool.sim.foreign.guarding import NodeGuarding
 from pmsmtool.sim.foreign.laws import Law
@@ -190,21 +190,29 @@ class ForeignDrive:
         )  # fmt: skip
 
 
-def unheld_of(file: str, machine_file: MachineFile) -> tuple[str, ...]:
-    """Return what of a motor a drive cannot hold by the limits of its file (path, or ``TABLE.csv#FAMILY``).
+def assumptions_of(file: str, machine_file: MachineFile | None = None) -> tuple[str, ...]:
+    """Return what a rehearsal with a file (path, or ``TABLE.csv#FAMILY``) assumes of the drive, one line each.
+
+    That is the modes of operation, where the file does not announce them, and what of a motor its limits cannot hold.
 
     Raises
     ------
     ConfigError
-        As ``file_rows.read_makers_objects``; or the file is that of the reference drive, which is simulated itself.
+        As ``file_rows.read_makers_objects``; or, with a motor, the file is that of the reference drive, which is
+        simulated itself.
     """
     objects = read_makers_objects(file)
-    if objects.stored(0x1018, 1) == VENDOR:
+    if machine_file is not None and objects.stored(0x1018, 1) == VENDOR:
         raise ConfigError(
             "the file is that of the reference drive, no other maker's", where=file,
             hint="give MACHINE as --sim MACHINE: that is the reference drive with this motor",
         )  # fmt: skip
-    return ForeignDrive(objects, set_up_of(machine_file)).unheld
+    assumed = assumed_modes(objects)
+    modes = ", ".join(str(bit + 1) for bit in range(16) if assumed >> bit & 1)
+    lines = (
+        [f"0x6502 is blank: modes {modes} are assumed by its objects; a real drive reports its own"] if assumed else []
+    )
+    return (*lines, *(() if machine_file is None else ForeignDrive(objects, set_up_of(machine_file)).unheld))
 
 
 def _within(objects: MakersObjects, set_up: SetUp) -> SetUp:

@@ -227,8 +227,20 @@ def laws_of(objects: MakersObjects, motor: SetUp) -> dict[tuple[int, int], Law]:
     return {at: law for at, law in laws.items() if at in objects.rows and objects.rows[at].data_type.letter}
 
 
+BY_OBJECTS = {1: (0x607A, 0x6081), 3: (0x606C, 0x60FF), 4: (0x6071,), 8: (0x607A, 0x60B0), 9: (0x60B1,), 10: (0x60B2,)}
+"""Modes of operation that a file does not announce, and the objects of each by which it is assumed all the same."""
+
+
+def assumed_modes(objects: MakersObjects) -> int:
+    """Return 0x6502 as the objects suggest, where the file leaves it blank; 0 where file or family state it."""
+    if objects.stored(0x6502) or family_of(objects).modes:
+        return 0
+    has = {mode: objects.has(*((index, 0) for index in needed)) for mode, needed in BY_OBJECTS.items()}
+    return sum(1 << mode - 1 for mode, there in has.items() if there)
+
+
 def modes_of(objects: MakersObjects) -> tuple[int, ...]:
     """Return the modes of operation the drive takes: what 0x6502 announces, and the maker's own."""
     family = family_of(objects)
-    announced = objects.stored(0x6502) or family.modes
+    announced = objects.stored(0x6502) or family.modes or assumed_modes(objects)
     return (*(bit + 1 for bit in range(16) if announced >> bit & 1), *family.own_modes)

@@ -110,15 +110,16 @@ def read_makers_objects(where: str) -> MakersObjects:
         found, label = dict(_of_table(data, path, family)), family
     else:
         found, label = dict(_of_eds(data, path)), path.stem
+    has_words = {(0x6040, 0), (0x6041, 0)} <= set(found)
     rows, assumed = _completed(found)
     profile = MakersObjects(label, rows, assumed)
     stated = profile.stored(0x1000) & 0xFFFF
-    has_words = {(0x6040, 0), (0x6041, 0)} <= set(found)
-    if stated not in (0, DRIVE_PROFILE) and (stated in PROFILES or not has_words):
+    if stated != DRIVE_PROFILE and (stated in PROFILES or not has_words):
+        named = f"of a device of profile {stated}" if stated else "of a device without control and status word (0x6040)"
         raise ConfigError(
-            f"the file is of a device of profile {stated}, not of a drive (CiA 402)",
+            f"the file is {named}, not of a drive (CiA 402)",
             where=where,
-            likely="a controller of another profile, which is neither simulated nor moved",
+            likely="a controller of another profile, or a master, which is neither simulated nor moved",
             hint="give the EDS or DCF of a drive",
         )
     return profile
