@@ -37,7 +37,8 @@ PROFILE = (
     "reference.profile_speed_rpm", "reference.profile_acceleration_rpm_per_s",
     "reference.profile_deceleration_rpm_per_s", "reference.profile_jerk_rpm_per_s2",
 )  # fmt: skip
-AXIS_ROWS = frozenset((TORQUE_PER_AMPERE, INCREMENTS, *CASCADE, *PID, *SPEED, *SPEED_FORWARD, *NOTCH, *PROFILE))
+AXIS_GAINS = (*SPEED, *SPEED_FORWARD, *CASCADE[:2], *PID[:3], CASCADE[2], PID[3])
+AXIS_ROWS = frozenset((TORQUE_PER_AMPERE, INCREMENTS, *AXIS_GAINS, *NOTCH, *PROFILE))
 """What the design of an axis decides, and what is written into a drive for it."""
 SPEED_LOOP, POSITION_LOOP = "axis_speed", "axis_position"
 

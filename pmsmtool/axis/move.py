@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -130,11 +132,21 @@ class MoveDifference:
         return self.second / self.first if self.first else float("nan")
 
 
-def compared_moves(first: MoveResult, second: MoveResult) -> list[MoveDifference]:
-    """Return two moves number by number."""
-    return [
+Rows = Iterable[Mapping[str, Any]]
+"""``name``, ``value`` and ``unit`` of what the record of a move keeps."""
+
+
+def compared_moves(first: MoveResult, second: MoveResult, kept: Sequence[Rows] = ((), ())) -> list[MoveDifference]:
+    """Return two moves number by number, then the gains that both drives held, as their records keep them."""
+    moves = [
         MoveDifference(name, unit, float(getattr(first, name)), float(getattr(second, name)))
         for name, unit in UNITS.items()
+    ]
+    before, after = ({str(row["name"]): row for row in rows} for rows in kept)
+    return moves + [
+        MoveDifference(name, str(row["unit"]), float(before[name]["value"]), float(row["value"]))
+        for name, row in after.items()
+        if name in before and name not in UNITS
     ]
 
 

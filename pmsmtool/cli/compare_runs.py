@@ -90,6 +90,7 @@ def _diff_of_moves(first: Path, second: Path, check: bool, out: Output) -> None:
     from pmsmtool.axis.move import SAME_WAY, compared_moves, move_result, shown
     from pmsmtool.cli.move import TRACE
     from pmsmtool.errors import CheckFailed, ConfigError
+    from pmsmtool.run_directory import RunDirectory
     from pmsmtool.trace_file import read_trace
 
     before, after = (move_result(read_trace(path / TRACE)) for path in (first, second))
@@ -98,7 +99,8 @@ def _diff_of_moves(first: Path, second: Path, check: bool, out: Output) -> None:
             f"the moves are of {shown(before.way_rad, 'rad')} and {shown(after.way_rad, 'rad')}", where=str(second),
             hint="compare the same move: the same --by, --speed and --acceleration",
         )  # fmt: skip
-    rows = compared_moves(before, after)
+    stages = [RunDirectory(path).read().stage(MOVE) for path in (first, second)]
+    rows = compared_moves(before, after, [() if stage is None else stage.values for stage in stages])
     cells = [
         (row.name, shown(row.first, row.unit), shown(row.second, row.unit), f"{row.ratio:.3g}" if row.first else "-")
         for row in rows

@@ -117,6 +117,7 @@ def move_command(
             shaft=motion.shaft or "free", load=motion.load, brake=motion.brake,
         )  # fmt: skip
         envelope.refuse_gravity()
+        gains = drive.held_gains()
         drive.error_limit_rad = ERROR_SHARE * abs(way_rad)
         lines = [
             *envelope.lines(),
@@ -137,6 +138,7 @@ def move_command(
     run.save(TRACE, trace_npz(trace))
     found = move_result(trace)
     values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]
+    values += [{"name": name, "value": value, "unit": _unit(name)} for name, value in gains.items()]
     peak = math.degrees(found.error_peak_rad)
     run.add(
         Stage(
@@ -145,7 +147,7 @@ def move_command(
         )
     )  # fmt: skip
     told = {} if source is None else _identified(source, trace, drive, run, path, out)
-    data = {"run": run.path, "move": asdict(found), "lent": lent, "identified": told}
+    data = {"run": run.path, "move": asdict(found), "gains": gains, "lent": lent, "identified": told}
     out.result("move", data, lambda: [*_lines(found), *_told(told)])
     out.note(f"run: {run.path}")
 

@@ -41,7 +41,7 @@ from pmsmtool.proof.stage import FOLDER, PREDICTION, read_proof, responses
 from pmsmtool.report import figures
 from pmsmtool.report.report import Change, Figure, Table, render
 from pmsmtool.report.verdict import COMPLETE, Verdict, is_simulated, verdict_of
-from pmsmtool.run_directory import RunDirectory, RunRecord
+from pmsmtool.run_directory import RunDirectory, RunRecord, Stage
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 
@@ -297,27 +297,29 @@ def _least_times(
     return np.array([0.0, *times]), {"i_d_a": np.array([0.0, *i_d[rows]]), "i_q_a": np.array([0.0, *i_q[rows]])}
 
 
-def _moves(run: RunDirectory, record: RunRecord) -> dict[str, Trace]:
+def _moves(run: RunDirectory, record: RunRecord) -> dict[str, tuple[Trace, Stage]]:
     """Return the run's move, after the same move of the same drive in the latest run before it, where there is one."""
-    if record.stage(MOVE) is None:
+    stage = record.stage(MOVE)
+    if stage is None:
         return {}
     last = read_trace(run.path / TRACE_OF_MOVE)
-    earlier = (path for path in sorted(run.path.parent.iterdir(), reverse=True) if path.name < run.path.name)
-    for path in earlier:
-        if not (path / TRACE_OF_MOVE).is_file() or not same_drive(RunDirectory(path).read().drive, record.drive):
+    runs = (path for path in sorted(run.path.parent.iterdir(), reverse=True) if path.name < run.path.name)
+    for path in runs:
+        kept = RunDirectory(path).read() if (path / TRACE_OF_MOVE).is_file() else None
+        if kept is None or not same_drive(kept.drive, record.drive) or (earlier := kept.stage(MOVE)) is None:
             continue
         before = read_trace(path / TRACE_OF_MOVE)
         if same_move(before, last):
-            return {f"before: {path.name}": before, f"this run: {run.path.name}": last}
-    return {f"this run: {run.path.name}": last}
+            return {f"before: {path.name}": (before, earlier), f"this run: {run.path.name}": (last, stage)}
+    return {f"this run: {run.path.name}": (last, stage)}
 
 
-def _move_table(moves: Mapping[str, Trace]) -> Table | None:
-    """Return the numbers of the moves as the report shows them."""
-    found = [move_result(trace) for trace in moves.values()]
+def _move_table(moves: Mapping[str, tuple[Trace, Stage]]) -> Table | None:
+    """Return the numbers of the moves, and the gains that the drive held, as the report shows them."""
+    found = [(move_result(trace), stage.values) for trace, stage in moves.values()]
     if not found:
         return None
-    rows = compared_moves(found[0], found[-1])
+    rows = compared_moves(found[0][0], found[-1][0], (found[0][1], found[-1][1]))
     both = len(found) > 1
     cells = [
         (
@@ -330,10 +332,11 @@ def _move_table(moves: Mapping[str, Trace]) -> Table | None:
     return heads, [[(text, "") for text in row] for row in cells]
 
 
-def _move_figures(moves: Mapping[str, Trace]) -> Iterator[Figure]:
+def _move_figures(moves: Mapping[str, tuple[Trace, Stage]]) -> Iterator[Figure]:
     if moves:
         again = "of the same move before and in this run" if len(moves) > 1 else "of the move"
-        yield figures.move_figure(moves, f"Following error {again}.")
+        traces = {name: trace for name, (trace, _) in moves.items()}
+        yield figures.move_figure(traces, f"Following error {again}.")
 
 
 def _changes(record: RunRecord) -> Sequence[Change]:

@@ -12,6 +12,7 @@ from contextlib import AbstractContextManager
 
 import numpy as np
 
+from pmsmtool.axis.design import AXIS_GAINS
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
@@ -78,6 +79,11 @@ class PositionDrive(TorqueDrive):
         self._taken: list[tuple[float, float, float, float]] = []
         self._recording = False
         self._start_counts = 0.0
+
+    def held_gains(self) -> dict[str, float]:
+        """Return the gains of speed and position that the drive holds now, by their names; those of its map."""
+        held = {name: self.parameters.held_value(name) for name in AXIS_GAINS}
+        return {name: value for name, value in held.items() if value is not None}
 
     # ---- motion ---------------------------------------------------------------------------------
 

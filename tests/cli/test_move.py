@@ -56,6 +56,11 @@ def test_the_same_move_with_stored_and_with_new_gains(tool: Tool, drive: Sequenc
     assert "now / before" in page and Path(before["run"]).name in page
     assert "the same move before and in this run" in page
     assert f">{rows['error_peak_rad']['ratio']:.3g}<" in page
+    gains = rows["position.pid_p_nm_per_rad"]  # as stored by the maker's tool, and as flashed
+    assert (gains["first"], gains["second"]) == tuple(
+        run["gains"]["position.pid_p_nm_per_rad"] for run in (before, after)
+    )
+    assert gains["ratio"] > 1.5 and "position.pid_p_nm_per_rad" in page
     assert tool("report", before["run"])[0] == 0  # there is no move before it
     assert "now / before" not in (Path(before["run"]) / "report.html").read_text(encoding="utf-8")
 
