@@ -26,7 +26,7 @@ import functools
 import hashlib
 import tempfile
 import unittest.mock
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,8 @@ from pmsmtool.native import library_name
 from pmsmtool.packaging.build_kernels import PACKAGE
 from pmsmtool.packaging.compiler import build_compiler, compile_library
 from pmsmtool.packaging.kernels import HEADERS, Kernel
+from pmsmtool.proof import stage
+from pmsmtool.proof.simulated import predict_proof
 from pmsmtool.sim import kernel
 from pmsmtool.sim.kernel import Setup, Simulation
 
@@ -90,6 +92,8 @@ def build() -> Path:
 def used() -> Iterator[str]:
     """Simulate with this plant inside the block, in this process; gives :func:`digest`.
 
+    The bands of a proof are predicted with the project's own plant, as on any drive.
+
     Raises
     ------
     CompilerError
@@ -110,9 +114,19 @@ def used() -> Iterator[str]:
             )
         first_init(self, setup, image, keep)
 
+    def predict(*arguments: Any, **options: Any) -> Any:
+        with _simulating(first_load, first_init):
+            return predict_proof(*arguments, **options)
+
+    with _simulating(load, init), unittest.mock.patch.object(stage, "predict_proof", predict):
+        yield digest()
+
+
+@contextlib.contextmanager
+def _simulating(load: Callable[[str], Any], init: Callable[..., None]) -> Iterator[None]:
     with unittest.mock.patch.object(native, "load", load), unittest.mock.patch.object(Simulation, "__init__", init):
         kernel.library.cache_clear()
         try:
-            yield digest()
+            yield
         finally:
             kernel.library.cache_clear()
