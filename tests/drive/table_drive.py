@@ -11,6 +11,7 @@ from pmsmtool.cia402 import Command
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive_maps.drive_map import DriveMap
 from tests.bus.scripted import NODE, ScriptedBus, ScriptedSlave
 
 Held = Mapping[DriveObject, float]
@@ -28,6 +29,8 @@ class TableDrive(ScriptedSlave):
     ----------
     shown : dict of DriveObject to callable
         Values that are computed whenever they are read.
+    fixed : dict of (int, int) to int
+        Objects that refuse a write, with the abort code.
     """
 
     def __init__(self, held: Held) -> None:
@@ -35,11 +38,16 @@ class TableDrive(ScriptedSlave):
         super().__init__(raw | {(item.index, item.sub): item.encode(value) for item, value in held.items()})
         self.objects.setdefault((0x6041, 0), (0x0240).to_bytes(2, "little"))
         self.shown: dict[DriveObject, Callable[[], float]] = {}
+        self.fixed: dict[tuple[int, int], int] = {}
 
     def answer(self, data: bytes) -> Iterator[bytes]:
         for item, value in self.shown.items():
             self.objects[item.index, item.sub] = item.encode(value())
         return super().answer(data)
+
+    def _step(self, data: bytes) -> list[bytes]:
+        code = self.fixed.get((data[1] | data[2] << 8, data[3])) if data[0] >> 5 == 1 else None
+        return super()._step(data) if code is None else [b"\x80" + data[1:4] + code.to_bytes(4, "little")]
 
     def _store(self, index: int, sub: int, body: bytes) -> None:
         super()._store(index, sub, body)
@@ -69,7 +77,7 @@ def opened(held: Held) -> Iterator[tuple[TableDrive, Connection]]:
 
 
 @contextmanager
-def node_of(held: Held) -> Iterator[tuple[TableDrive, DriveNode]]:
+def node_of(held: Held, drive_map: DriveMap | None = None) -> Iterator[tuple[TableDrive, DriveNode]]:
     """Open the node of a drive with these objects."""
     with opened(held) as (table, connection):
-        yield table, DriveNode(connection, NODE)
+        yield table, DriveNode(connection, NODE, drive_map=drive_map)

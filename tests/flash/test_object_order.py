@@ -90,9 +90,9 @@ def test_objects_are_written_in_an_order_that_a_drive_takes() -> None:
         table.writes.clear()
         drive.replace(wanted)
         assert table.writes == [], "what is held is not written again"
-        table.refuse[0x3000, 2] = 0x08000022
+        table.fixed[0x3000, 2] = 0x08000022
         drive.replace({whole("3000:2"): b"\x29", whole("1017:0"): b"\0\0"})
         assert list(drive.refused) == [whole("3000:2")] and "0x08000022" in drive.refused[whole("3000:2")]
-        del table.refuse[0x3000, 2]
+        table.fixed.clear()
         drive.replace({whole("3000:2"): b"\x29"})
         assert drive.refused == {}
