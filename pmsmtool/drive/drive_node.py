@@ -361,16 +361,20 @@ class DriveNode:
             It does not within twice ``STORE_TIMEOUT_S``.
         """
         deadline = self.connection.clock.now() + STORE_TIMEOUT_S
-        while self.connection.clock.now() < deadline:
-            try:
-                self.sdo.upload(*objects.STORE_ALL, tries=1)
-                return
-            except DriveTimeout:
-                pass
-            except SdoAbort as abort:
-                if abort.code in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY):
-                    return  # it answers, and cannot be asked for more
-            self.connection.wait(STORE_POLL_S)
+        slow = self.sdo.slow_objects.pop(objects.STORE_ALL)  # of the command: a question is answered at once, or not
+        try:
+            while self.connection.clock.now() < deadline:
+                try:
+                    self.sdo.upload(*objects.STORE_ALL, tries=1)
+                    return
+                except DriveTimeout:
+                    pass
+                except SdoAbort as abort:
+                    if abort.code in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY):
+                        return  # it answers, and cannot be asked for more
+                self.connection.wait(STORE_POLL_S)
+        finally:
+            self.sdo.slow_objects[objects.STORE_ALL] = slow
         raise DriveTimeout(
             f"the drive does not finish storing within {2 * STORE_TIMEOUT_S:g} s",
             where=f"node {self.node}, 0x1010:01",
