@@ -29,8 +29,68 @@ def dictionary() -> canopen.ObjectDictionary:
     return canopen.import_od(str(data_folder("firmware-params") / "pmsmsim" / "pmsmsim.eds"))
 
 
-ON_OTHER_DRIVES = {"PROFILE_DECELERATION", "GUARD_TIME_MS", "LIFE_TIME_FACTOR"}
+ON_OTHER_DRIVES = {"GUARD_TIME_MS", "LIFE_TIME_FACTOR"}
 """Objects that the tool reads where a drive has them, and the reference drive has not."""
+
+
+MEANT = {
+    "ABORT_CONNECTION": "Abort connection option code", "AVERAGE_COMMAND": "Command",
+    "AVERAGE_PERIODS": "Window length", "AVERAGE_STATE": "State", "CONFIGURATION_DATE": "Configuration date",
+    "CONFIGURATION_TIME": "Configuration time", "CONTROLWORD": "Controlword",
+    "CURRENT_PERMILLE": "Current actual value", "DEVICE_TYPE": "Device type",
+    "ENCODER_INCREMENTS": "Encoder increments", "ERROR_CODE": "Error code", "ERROR_REGISTER": "Error register",
+    "EXCITATION_COMMAND": "Command", "EXCITATION_FIELDS.abort_current_apk": "Abort current",
+    "EXCITATION_FIELDS.abort_speed_rad_s": "Abort speed, electrical", "EXCITATION_FIELDS.amplitude": "Amplitude",
+    "EXCITATION_FIELDS.amplitude_q": "Amplitude of the second axis",
+    "EXCITATION_FIELDS.bias_bandwidth_rad_s": "Bandwidth of the current loop that holds the bias",
+    "EXCITATION_FIELDS.bias_d_a": "Bias d", "EXCITATION_FIELDS.bias_q_a": "Bias q",
+    "EXCITATION_FIELDS.duration_s": "Duration", "EXCITATION_FIELDS.f0_hz": "Start frequency",
+    "EXCITATION_FIELDS.f1_hz": "End frequency", "EXCITATION_FIELDS.fixed_angle_rad": "Fixed electrical angle",
+    "EXCITATION_FIELDS.hold_periods": "Hold time per level",
+    "EXCITATION_FIELDS.i_centre_d_a": "Centre of the d pulses",
+    "EXCITATION_FIELDS.i_limit_d_a": "Current that flips the d pulses",
+    "EXCITATION_FIELDS.i_limit_q_a": "Current that flips the q pulses", "EXCITATION_FIELDS.point": "Injection point",
+    "EXCITATION_FIELDS.shape": "Shape", "FAULT_REACTION": "Fault reaction option code",
+    "LIVE.T_magnet_c": "Magnet temperature", "LIVE.T_winding_c": "Winding temperature",
+    "LIVE.U_dc_v": "DC-link voltage", "LIVE.binding": "Governor", "LIVE.flags": "Flags",
+    "LIVE.following_error_rad": "Following error, mechanical", "LIVE.hall_pattern": "Hall wires, bit k of wire k",
+    "LIVE.i_a_a": "Phase current a", "LIVE.i_b_a": "Phase current b", "LIVE.i_c_a": "Phase current c",
+    "LIVE.i_d_a": "i_d, sampled", "LIVE.i_d_ref_a": "i_d reference after the governor",
+    "LIVE.i_d_req_a": "i_d reference before the governor", "LIVE.i_q_a": "i_q, sampled",
+    "LIVE.i_q_ref_a": "i_q reference after the governor", "LIVE.i_q_req_a": "i_q reference before the governor",
+    "LIVE.iterations": "Solver iterations of the period", "LIVE.kappa": "Governor",
+    "LIVE.omega_e_rad_s": "Electrical speed", "LIVE.theta_e_rad": "Electrical angle",
+    "LIVE.theta_m_rad": "Mechanical angle, encoder, unwrapped",
+    "LIVE.torque_nm": "Torque from currents and parameters", "LIVE.u_d_lim_v": "u_d after the limiter",
+    "LIVE.u_d_v": "u_d command before the limiter", "LIVE.u_q_lim_v": "u_q after the limiter",
+    "LIVE.u_q_v": "u_q command before the limiter", "MAX_CURRENT_PERMILLE": "Max current",
+    "MAX_SPEED_RPM": "Max motor speed", "MODE": "Modes of operation", "MODE_DISPLAY": "Modes of operation display",
+    "PRODUCER_HEARTBEAT_MS": "Producer heartbeat time", "PROFILE_ACCELERATION": "Profile acceleration",
+    "PROFILE_DECELERATION": "Profile deceleration", "PROFILE_JERK": "Jerk of every ramp, 0",
+    "PROFILE_VELOCITY": "Profile velocity", "QUICK_STOP_DECELERATION": "Quick stop deceleration",
+    "QUICK_STOP_OPTION": "Quick stop option code", "RATED_CURRENT_MA": "Motor rated current",
+    "SET_COMMAND": "Command", "SET_CRC_ACTIVE": "Active value CRC32", "SET_CRC_EXPECTED": "Expected value CRC32",
+    "SET_CRC_STORED": "Stored value CRC32", "SET_OFFENDER": "First offending object",
+    "SET_POINT_ANGLE": "Fixed electrical angle", "SET_POINT_D": "i_d", "SET_POINT_Q": "i_q",
+    "SET_SCHEMA": "Schema version", "SET_SIGNATURE": "Layout signature", "SET_STATE": "State",
+    "STATUSWORD": "Statusword", "SUPPORTED_MODES": "Supported drive modes", "TARGET_TORQUE_PERMILLE": "Target torque",
+    "TARGET_VELOCITY_MRPM": "Target velocity", "TRACE_CAPACITY": "Capacity", "TRACE_COMMAND": "Command",
+    "TRACE_CRC": "CRC32 of the data", "TRACE_DECIMATION": "Decimation", "TRACE_DEPTH": "Depth",
+    "TRACE_PERIOD_NS": "Sample period", "TRACE_POSITION": "Trigger position", "TRACE_PRETRIGGER": "Pre-trigger",
+    "TRACE_STATE": "State", "TRACE_STORED": "Samples stored", "TRACE_TRIGGER": "Trigger",
+    "TRACE_VOLTAGE_LAG": "The voltage of row k - this acts from row k on", "VELOCITY_MRPM": "Velocity actual value",
+}  # fmt: skip
+"""How the reference drive's data sheet calls them."""
+NUMBERED = {
+    "TRACE_CHANNELS": "Channel {}", "AVERAGE_MEANS": "Mean of channel {}", "AVERAGE_CHANNELS": "Channel {}",
+}  # fmt: skip
+OTHER_ADDRESSES = {
+    "DEVICE_NAME": (0x1008, 0), "HARDWARE_VERSION": (0x1009, 0), "SOFTWARE_VERSION": (0x100A, 0),
+    "STORE_ALL": (0x1010, 1), "SET_IMAGE": (0x2001, 0), "EXCITATION_BUFFER": (0x2051, 0), "TRACE_DATA": (0x2062, 0),
+    "ERROR_HISTORY": 0x1003, "CONSUMER_HEARTBEAT": 0x1016, "IDENTITY": 0x1018,
+    "GUARD_TIME_MS": DriveObject(0x100C, 0, "H"), "LIFE_TIME_FACTOR": DriveObject(0x100D, 0, "B"),
+}  # fmt: skip
+"""Texts, domains, records, and what the reference drive has not."""
 
 
 @pytest.mark.parametrize("name", sorted(set(all_objects()) - ON_OTHER_DRIVES))
@@ -39,6 +99,30 @@ def test_index_sub_and_type(dictionary: canopen.ObjectDictionary, name: str) -> 
     variable = dictionary.get_variable(item.index, item.sub)
     assert isinstance(variable, ODVariable), f"{name} is not in the EDS"
     assert LETTERS[variable.data_type or 0] == item.letter
+    group, _, number = name.rstrip("]").partition("[")
+    meant = NUMBERED[group].format(int(number) + 1) if number else MEANT[name]
+    assert variable.name.startswith(meant), "another object of the same type"
+
+
+def test_addresses_of_texts_domains_and_records() -> None:
+    assert {name: getattr(objects, name) for name in OTHER_ADDRESSES} == OTHER_ADDRESSES
+    for group in NUMBERED:
+        assert len(getattr(objects, group)) == 8
+
+
+@pytest.mark.parametrize(
+    ("letter", "value", "data", "back"),
+    [
+        ("b", -1, b"\xff", -1.0), ("B", 254.6, b"\xff", 255.0), ("h", -2.4, b"\xfe\xff", -2.0),
+        ("H", 0x1234, b"\x34\x12", 4660.0), ("i", -3, b"\xfd\xff\xff\xff", -3.0),
+        ("I", 2**32 - 1, b"\xff" * 4, 2.0**32 - 1),
+        ("f", 0.5, b"\0\0\0\x3f", 0.5),
+    ],
+)  # fmt: skip
+def test_a_number_in_an_object(letter: str, value: float, data: bytes, back: float) -> None:
+    item = DriveObject(0x2070, 0x1A, letter)
+    assert item.encode(value) == data and item.decode(data) == back and item.size == len(data)
+    assert item.mapping_word == 0x2070_1A_00 + 8 * len(data)
 
 
 def test_every_field_of_an_excitation_has_an_object() -> None:
