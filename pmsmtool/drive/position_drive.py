@@ -135,10 +135,9 @@ class PositionDrive(TorqueDrive):
         if sending is not None:
             sending.__exit__(None, None, None)
         table = np.array(self._taken, dtype=np.float64).reshape(len(self._taken), 4)
-        first = table[0, 0] if len(table) else 0.0
         units = {"theta_m_rad": "rad", "theta_ref_rad": "rad", "i_q_a": "A"}
         signals = dict(zip(units, table[:, 1:].T, strict=True))
-        return Trace(table[:, 0] - first, signals, units, {"polled": not self.sends})
+        return Trace(table[:, 0] - table[:1, 0], signals, units, {"polled": not self.sends})
 
     def wait(self, seconds: float) -> None:
         """Let time pass; asks for samples where the drive does not send them, and watches the following error."""

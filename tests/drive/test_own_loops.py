@@ -17,7 +17,7 @@ from pmsmtool.drive import motion_objects as motion
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
-from pmsmtool.drive.position_drive import FOLLOWS_S, FOLLOWS_SHARE, WHOLE_WAY, PositionDrive
+from pmsmtool.drive.position_drive import FOLLOWS_S, FOLLOWS_SHARE, PositionDrive
 from pmsmtool.drive.set_point import ACKNOWLEDGE_S, POSITION_DEMAND, TARGET_POSITION, start_move
 from pmsmtool.drive.speed_loop_drive import LARGEST_COUNT, OSCILLATION_SAMPLES, Oscillation, SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
@@ -82,12 +82,14 @@ def positioned(more: Held | None = None, drive_map: DriveMap = GENERIC) -> Itera
 @pytest.mark.parametrize(
     ("lacks", "modes", "named"),
     [
-        (None, 0x7FE, "profile position mode"), (TARGET_POSITION, 1, "a target position"),
+        (None, 0x7FE, "profile position mode"), (objects.SUPPORTED_MODES, None, "profile position mode"),
+        (TARGET_POSITION, 1, "a target position"),
         (POSITION_DEMAND, 1, "its position demand"), (None, 0x1, ""),
     ],
 )  # fmt: skip
-def test_what_a_position_drive_must_have(lacks: Any, modes: int, named: str) -> None:
-    held = {item: value for item, value in HELD.items() if item is not lacks} | {objects.SUPPORTED_MODES: modes}
+def test_what_a_position_drive_must_have(lacks: Any, modes: int | None, named: str) -> None:
+    held = HELD | ({} if modes is None else {objects.SUPPORTED_MODES: modes})
+    held = {item: value for item, value in held.items() if item is not lacks}
     with opened(held) as (_, connection):
         if not named:
             assert PositionDrive(connection, NODE, drive_map=GENERIC).sends
@@ -151,15 +153,16 @@ def test_a_record_without_a_sample_is_empty() -> None:
         assert len(drive.end_samples()) == 0
 
 
-LIMIT_RAD = 1.0
+LIMIT_RAD = 2.0
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
 @pytest.mark.parametrize(
     ("lag", "nearer", "ended"),
     [
-        (0.99, 0.0, False), (1.01, 0.0, True), (1.01, 2.0 * FOLLOWS_SHARE, False), (1.01, 0.5 * FOLLOWS_SHARE, True),
-        (1.01, -0.5, True), (WHOLE_WAY - 0.01, 0.5, False), (WHOLE_WAY + 0.01, 0.5, True), (0.5, -0.5, False),
+        (0.99, 0.0, False), (1.0, 0.0, False), (1.01, 0.0, True), (1.01, 2.0 * FOLLOWS_SHARE, False),
+        (1.01, 0.5 * FOLLOWS_SHARE, True),
+        (1.01, -0.5, True), (2.19, 0.5, False), (2.21, 0.5, True), (0.5, -0.5, False),
     ],
 )  # fmt: skip
 def test_a_move_ends_where_the_shaft_lags_and_does_not_follow(
@@ -174,11 +177,11 @@ def test_a_move_ends_where_the_shaft_lags_and_does_not_follow(
     drive._polled, drive.sends, drive._recording, drive.error_limit_rad = (), True, True, LIMIT_RAD
     drive._taken = []
     drive.wait(0.01)  # without a sample there is nothing to judge
-    demand = 3.0 * way
-    at = demand - way * lag
+    demand = 8.0 * way
+    at, nearer = demand - way * lag * LIMIT_RAD, nearer * LIMIT_RAD
     drive._taken = [
         (0.0, at - way * 99.0, demand, 0.0), (1.0 - FOLLOWS_S, at - way * nearer, demand, 0.0),
-        (1.0 - 0.5 * FOLLOWS_S, at + way * 99.0, demand, 0.0), (1.0, at, demand, 0.0),
+        (1.0 - 0.5 * FOLLOWS_S, at + way * 99.0, demand + 50.0, 0.0), (1.0, at, demand, 0.0),
     ]  # fmt: skip
     if ended:
         with pytest.raises(LimitExceeded, match="following error") as caught:
@@ -194,7 +197,7 @@ def test_a_move_ends_where_the_shaft_lags_and_does_not_follow(
 def test_before_the_window_is_full_the_first_sample_counts() -> None:
     drive = object.__new__(PositionDrive)
     drive.error_limit_rad = LIMIT_RAD
-    drive._taken = [(1.0, 0.0, 3.0, 0.0), (1.01, 0.02, 3.0, 0.0)]
+    drive._taken = [(1.0, 0.0, 3.0, 0.0), (1.01, 0.03, 3.0, 0.0)]
     assert drive._follows(2.98) and not drive._follows(-2.98)
 
 
