@@ -325,7 +325,7 @@ MARKS: Sequence[tuple[str, int, int]] = (
 
 def _marks_last(entry: Entry) -> int:
     names = [name for name, _, _ in MARKS]
-    return names.index(entry.name) + 1 if entry.name in names else 0
+    return names.index(entry.name) if entry.name in names else -1
 
 
 def _checked(table: Any, keys: tuple[Key, ...], where: str, wrong: list[str]) -> dict[str, Any]:

@@ -113,7 +113,7 @@ class Plan:
             What to say behind an entry, by its name.
         """
         rows = [_row(change, (marks or {}).get(change.name, "")) for change in self.changes]
-        widths = [max((len(row[k]) for row in rows), default=0) for k in range(4)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = [
             f"{r[0]:<{widths[0]}}  {r[1]:>{widths[1]}} -> {r[2]:>{widths[2]}} {r[3]:<{widths[3]}}  {r[4]}".rstrip()
             for r in rows

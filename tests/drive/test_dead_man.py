@@ -24,8 +24,6 @@ from pmsmtool.sim.node.dictionary import Refused
 from tests.bus.scripted import ScriptedBus, ScriptedSlave
 from tests.drive.bench import ENVELOPE, SimBench, sim_bench
 
-pytestmark = pytest.mark.wall_clock
-
 
 @pytest.fixture
 def bench() -> Iterator[SimBench]:
@@ -175,6 +173,7 @@ def test_killed_tool_stops_the_machine(bench: SimBench) -> None:
 
 
 @pytest.mark.chain
+@pytest.mark.wall_clock
 def test_heartbeat_on_the_wall_clock_has_its_own_thread() -> None:
     """A main thread busy for a second: the gaps between heartbeats stay far below the consumer time."""
     bus = ScriptedBus(ScriptedSlave())
