@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -29,7 +30,7 @@ class Shown:
 
     def __init__(self) -> None:
         self.t_s, self.active_s = 50.0, -math.inf
-        self.values = {"i_d_a": 0.0, "i_q_a": 0.0, "omega_e_rad_s": 0.0, "theta_m_rad": 1.0}
+        self.values: dict[str, Any] = {"i_d_a": 0.0, "i_q_a": 0.0, "omega_e_rad_s": 0.0, "theta_m_rad": 1.0}
         self.asked: list[Any] = []
         self.may_be_energised, self.stops_by_ramp, self.period_s = True, False, 1e-3
         self.identity = None
@@ -53,7 +54,7 @@ class Shown:
 
     def live(self, name: str) -> float:
         value = self.values[name]
-        return value.pop(0) if isinstance(value, list) else value
+        return float(value.pop(0) if isinstance(value, list) else value)
 
     def take(self, recording: Any, wait: Any) -> Any:
         self.asked.append(recording)
@@ -175,10 +176,11 @@ def test_a_move_keeps_the_speed_of_the_envelope(drive: Shown, velocity: int, end
     else:
         recording: Any = guard_of(drive).record_move(["i_q_a"], 10, 2, move)
         assert recording.move == move and recording.decimation == 2
-    for commanded in (
+    commands: tuple[Callable[[GuardedDrive], object], ...] = (
         lambda guard: guard.record_move([], 1, 1, replace(move, velocity=1)), lambda guard: guard.command_speed(1.0),
         lambda guard: guard.record([], 1, excitation=wave(Shape.STEP, Injection.SPEED, 1.0)),
-    ):  # fmt: skip
+    )  # fmt: skip
+    for commanded in commands:
         with pytest.raises(SafetyRefusal, match="--shaft locked"):
             commanded(guard_of(drive, replace(ENVELOPE, shaft="locked")))
 
@@ -285,7 +287,8 @@ def test_means_are_taken_while_the_guard_looks(drive: Shown) -> None:
     assert guard.average(["i_d_a"], 120) == {"i_d_a": 1.0}
     names = [each[0] for each in drive.asked]
     assert names[0] == "start_average" and names[-1] == "check_operating" and names.count("wait") == 3
-    assert drive.t_s == pytest.approx(50.12) and guard.halves(["i_d_a"], 10) == {"i_d_a": 1.0}
+    both: Any = guard.halves(["i_d_a"], 10)
+    assert drive.t_s == pytest.approx(50.13) and both == {"i_d_a": 1.0}
 
 
 def prover(drive: Shown, monkeypatch: pytest.MonkeyPatch, held: float | None = 6.0) -> tuple[GuardedDrive, list[Any]]:

@@ -96,7 +96,7 @@ def test_the_current_that_is_shown(
                 motion.shown_current(node, 10.0)
             return
         found = motion.shown_current(node, 10.0)
-        assert (found.item, found.per_count) == (shown.item, pytest.approx(shown.per_count))
+        assert found.item == shown.item and found.per_count == pytest.approx(shown.per_count)
         assert motion.undecided(node, 10.0) == open_kind
 
 
@@ -124,7 +124,8 @@ def test_the_torque_mode(modes: int, more: Held, mode: int | None, with_own: boo
             assert (target.quantity.item, target.quantity.per_count) == (objects.TARGET_TORQUE_PERMILLE, 0.01)
         elif with_own:
             target = motion.torque_target(node, 10.0)
-            assert (target.mode, target.quantity.item, target.quantity.per_count) == (-3, item, pytest.approx(0.01))
+            assert (target.mode, target.quantity.item) == (-3, item)
+            assert target.quantity.per_count == pytest.approx(0.01)
         else:
             with pytest.raises(NotAvailable, match=f"0x6502 = {modes:#x}"):
                 motion.torque_target(node, 10.0)
@@ -185,7 +186,10 @@ TURNED = {motion.POLARITY: 0x80}
         ({motion.POSITION_UNIT: 0x00410000}, 360.0), ({motion.POSITION_UNIT: 0xFD410000, **COUNTS}, 360e3),
         ({motion.POSITION_UNIT: 0x01410000, **TURNED}, -36.0), ({motion.POSITION_UNIT: 0xFD410000, **GEAR}, 144e3),
         ({motion.POSITION_UNIT: 0x7F410000}, "0 units|e-125 units"), ({motion.POSITION_UNIT: 0x80410000}, 360e128),
-        ({motion.POSITION_UNIT: 0xFD010000, **COUNTS}, 4096.0), ({motion.POSITION_UNIT: 0x00B50000, **COUNTS}, 4096.0),
+        ({motion.POSITION_UNIT: 0xFD010000, **COUNTS}, "says nothing of a turn"),
+        ({motion.POSITION_UNIT: 0xFD010000, **FEED}, 2400.0), ({motion.POSITION_UNIT: 0x00B50000, **COUNTS}, 4096.0),
+        ({motion.POSITION_UNIT: 0xFD100000}, 2e3 * math.pi), ({motion.POSITION_UNIT: 0xFDB40000}, 1000.0),
+        ({motion.POSITION_UNIT: 0x00420000}, 21600.0), ({motion.POSITION_UNIT: 0x01430000}, 129600.0),
         ({motion.ENCODER_COUNTS: 24}, 24.0), ({motion.ENCODER_COUNTS: 23}, "23 units of position, 24 are needed"),
         ({motion.ENCODER_COUNTS: 0}, "0 units of position"), ({}, "does not report how many increments"),
     ],
@@ -233,7 +237,7 @@ def test_limits_in_their_order_and_units() -> None:
     [
         ({objects.MAX_CURRENT_PERMILLE: 1500}, 15.0), ({motion.MAX_TORQUE_PERMILLE: 800}, 8.0), ({}, None),
         ({objects.MAX_CURRENT_PERMILLE: 1500, motion.MAX_TORQUE_PERMILLE: 800}, 15.0),
-        ({DriveObject(0x6073, 0, "I"): 1500, motion.MAX_TORQUE_PERMILLE: 800}, 8.0),  # of another type: none
+        ({DriveObject(0x6073, 0, "I"): 1500, motion.MAX_TORQUE_PERMILLE: 800}, 15.0),  # of another width
     ],
 )  # fmt: skip
 def test_the_first_limit_that_the_drive_has_counts(held: Held, number: float | None) -> None:
@@ -249,10 +253,10 @@ def test_what_cannot_be_read_counts_as_missing_and_a_busy_drive_does_not(code: i
     with node_of({objects.MODE: 1}) as (table, node):
         table.refuse[0x6060, 0] = code
         if missing:
-            assert motion.held(node, objects.MODE) is None
+            assert node.held(objects.MODE) is None
         else:
             with pytest.raises(SdoAbort):
-                motion.held(node, objects.MODE)
+                node.held(objects.MODE)
 
 
 @pytest.mark.parametrize(

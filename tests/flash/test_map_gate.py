@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,10 +63,11 @@ MAXON = identity(0xFB, 0x61500000)
 def test_a_map_is_for_the_drive_that_it_names(
     drive_map: DriveMap, who: Identity, moved: bool, written: bool, hint: str, tmp_path: Path
 ) -> None:
-    for allowed, check in (
+    checks: tuple[tuple[bool, Callable[[], None]], ...] = (
         (moved, lambda: check_motion(drive_map, who)),
         (written, lambda: check_map(drive_map, who, JournalFolder(who, tmp_path))),
-    ):
+    )
+    for allowed, check in checks:
         if allowed:
             check()
             continue
