@@ -38,8 +38,9 @@ steady-state row and current limit beyond that is left and approached again for 
 EPS_LISTED = (0.1, 0.01, 1e-3)
 """Tightenings whose horizon is listed beside the chosen one."""
 
-OBSERVER_TIME_S = 0.8e-3
-"""Time constant of the disturbance observer (docs/control.md, 1: gain 0.1 at 12 kHz)."""
+OBSERVER_TIME_S, OBSERVER_TIME_SATURATED_S = 0.8e-3, 8e-3
+"""Time constant of the disturbance observer (docs/control.md, 1 and 7: gain 0.1 at 12 kHz). The large inductance of a
+saturated machine makes volts of the noise of a sample, L/T_s of it."""
 
 SLACK = 2e-4
 """Squared voltage over the limit, relative, that counts as none: seen up to 1.1e-4 in the exact plant."""
@@ -145,7 +146,7 @@ def design_governor(
     chosen, why = _eps(error if predicts else 0.0, eps)
     found = horizon(model, omega, V_max, chosen) if predicts else None
     listed = {f"k_max_eps_{e:g}": _fact(horizon(model, omega, V_max, e)) for e in EPS_LISTED if predicts}
-    observer = 0.0 if source.flux_map is not None else min(1.0, source.inverter.T_s / OBSERVER_TIME_S)
+    observer = OBSERVER_TIME_SATURATED_S if source.flux_map is not None else OBSERVER_TIME_S
     fast = V_max * source.inverter.T_s > STEERED_STEP * rated.I_max_apk * min(model.L_d, model.L_q)
     options, how = _options(mode, predictor, fast)
     values = {
@@ -154,9 +155,7 @@ def design_governor(
         "governor.eps": DesignValue(chosen, why),
         "governor.options": DesignValue(options, how),
         "governor.I_transient_apk": DesignValue(rated.I_max_apk, "I_max"),
-        "governor.observer_gain": DesignValue(
-            observer, "off: saturation, the integrators' share is used" if observer == 0.0 else f"{OBSERVER_TIME_S:g} s"
-        ),
+        "governor.observer_gain": DesignValue(min(1.0, source.inverter.T_s / observer), f"{observer:g} s"),
         "governor.slack": DesignValue(SLACK, "above what an exact plant shows"),
     }
     facts: dict[str, Scalar] = {"governor_euler_error_at_n_max": error}

@@ -120,6 +120,14 @@ def test_random_saturated_machines_brake_out_of_reach_without_a_limit_cycle(
     assert np.ptp(i[:, -600:], axis=1).max() < SWING * 20.0
 
 
+@pytest.mark.chain
+def test_what_the_integrators_still_forget_does_not_move_an_unreachable_reference() -> None:
+    source = ideal(draw_around(saturated(), 2301009, spread=0.2))  # by the integrators' share: 21.2 ms
+    points = [(1.54, -3.84), (3.16, -18.32)]
+    i = current_after(source, tune(source).parameter_set(), -1032.8, points, 0.12)
+    assert settling_s(i, 0.29) < UNREACHABLE_S  # 2 % of the step; measured 9.3 ms
+
+
 def test_the_core_reports_the_torque_of_the_map() -> None:
     source = saturated()
     schedule = {"i_d_a": ((0.0, -10.0),), "i_q_a": ((0.0, 12.0),), "driven_rpm": ((0.0, 300.0),)}
