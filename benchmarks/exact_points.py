@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: MIT
 """Look-up tables of random machines against operating points enumerated exactly by roots of polynomials.
 
-    python -m benchmarks.exact_points [--machines 1000] [--seed 1] [--map]
+    python -m benchmarks.exact_points [--machines 1000] [--seed 1] [--map] [--wide]
 
 Each machine has constant inductances (surface, salient either way, nearly without magnet), a resistance from none to
 half of the voltage at full current, in a quarter of the cases a demagnetisation limit; its eight speeds run from
 standstill to beyond the last reachable one, both ways. Eleven torques per speed: inside, near both limits of that speed
 (1e-2 to 1e-6 of its span) and beyond them: 88 cells. ``--map`` gives the same machine as a flux map, whose cubic
-cells hold a linear flux exactly, so that the path of a saturated machine meets the same truth. Printed are the largest
-errors, and the cells beyond the limits of this file by kind. Exit code 1 when there are any.
+cells hold a linear flux exactly, so that the path of a saturated machine meets the same truth. ``--wide`` draws from
+:data:`WIDE`: resistances that take up to five times the voltage at full current, reactive flux from a thousandth of
+the magnet's to fifty times, saliency up to 30 either way. Printed are the largest errors, and the cells beyond the
+limits of this file by kind. Exit code 1 when there are any.
 """
 
 from __future__ import annotations
@@ -47,6 +49,27 @@ SHARES = (-0.1, 1e-6, 1e-4, 1e-2, 0.5, 0.8, 0.99, 0.9999, 0.999999, 1.05)
 SPEEDS = 8
 
 
+@dataclass(frozen=True, slots=True)
+class Ranges:
+    """Powers of ten that machines are drawn from."""
+
+    flux: tuple[float, float]
+    """L_q I_max over psi_f."""
+
+    saliency: tuple[tuple[float, float], ...]
+    """L_q over L_d of surface, interior, inversely salient machines and of those nearly without magnet."""
+
+    magnet: tuple[float, float]
+    """Of the last kind, over that of the others."""
+
+    resistance: tuple[float, float]
+    """R I_max over the voltage."""
+
+
+USUAL = Ranges((-1.3, 1.0), ((0.0, 0.0), (0.02, 0.9), (-0.4, -0.01), (0.5, 1.0)), (-2.0, -0.5), (-3.5, -0.3))
+WIDE = Ranges((-3.0, 1.7), ((0.0, 0.0), (0.0, 1.5), (-1.5, 0.0), (0.3, 1.5)), (-4.0, -0.5), (-6.0, 0.7))
+
+
 @dataclass(slots=True)
 class Tally:
     """What was found: the largest errors, and cells beyond what is allowed, by kind."""
@@ -64,17 +87,16 @@ class Tally:
             self.wrong[kind] += 1
 
 
-def random_machine(rng: np.random.Generator) -> tuple[OperatingMachine, LinearCase]:
+def random_machine(rng: np.random.Generator, ranges: Ranges = USUAL) -> tuple[OperatingMachine, LinearCase]:
     """Draw a machine and its limits; the speed is still 0."""
     pole_pairs, I_max, V = int(rng.integers(1, 9)), 10.0 ** rng.uniform(0.0, 2.7), 10.0 ** rng.uniform(1.0, 2.8)
     psi_f = 10.0 ** rng.uniform(-2.5, 0.0)
-    L_q = psi_f / I_max * 10.0 ** rng.uniform(-1.3, 1.0)
+    L_q = psi_f / I_max * 10.0 ** rng.uniform(*ranges.flux)
     kind = rng.choice(4, p=[0.25, 0.5, 0.15, 0.1])
-    low, high = ((0.0, 0.0), (0.02, 0.9), (-0.4, -0.01), (0.5, 1.0))[kind]
-    L_d = L_q / 10.0 ** rng.uniform(low, high)
+    L_d = L_q / 10.0 ** rng.uniform(*ranges.saliency[kind])
     if kind == 3:
-        psi_f *= 10.0 ** rng.uniform(-2.0, -0.5)
-    R = 0.0 if rng.random() < 0.1 else V / I_max * 10.0 ** rng.uniform(-3.5, -0.3)
+        psi_f *= 10.0 ** rng.uniform(*ranges.magnet)
+    R = 0.0 if rng.random() < 0.1 else V / I_max * 10.0 ** rng.uniform(*ranges.resistance)
     i_d_min = -I_max * rng.uniform(0.05, 1.0) if rng.random() < 0.25 else -math.inf
     machine = OperatingMachine(pole_pairs, R, L_d, L_q, psi_f)
     return machine, LinearCase(R, L_d, L_q, psi_f, 0.0, V, I_max, i_d_min)
@@ -164,11 +186,12 @@ def main() -> int:
     parser.add_argument("--machines", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--map", action="store_true", help="give each machine as a flux map")
+    parser.add_argument("--wide", action="store_true", help="draw from a wider population")
     options = parser.parse_args()
     tally = Tally()
     for number in range(options.machines):
         rng = np.random.default_rng([options.seed, number])
-        machine, case = random_machine(rng)
+        machine, case = random_machine(rng, WIDE if options.wide else USUAL)
         solved = as_map(machine, case.I_max) if options.map else machine
         for omega in speeds(rng, case):
             check_speed(solved, replace(case, omega=omega), rng, tally, f"machine {number}")

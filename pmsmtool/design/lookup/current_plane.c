@@ -149,21 +149,33 @@ static double level_error(const pmsm_curve *curve, const pmsm_point *at, double 
     return pmsm_voltage_squared(curve->plane, at, curve->omega) - curve->level;
 }
 
+/* Newton's method along the gradient. A step that overshoots, as the first one from inside a thin ellipse, is halved. */
 int32_t pmsm_curve_correct(const pmsm_curve *curve, pmsm_point *at)
 {
-    double before = INFINITY, error = INFINITY, floor = 0.0;
+    double before = INFINITY, error = INFINITY, floor = 0.0, step_d = 0.0, step_q = 0.0;
+    pmsm_point from = *at;
     for (int32_t k = 0; k < CORRECTIONS_MAX; k++) {
         double gradient[2], size, slope;
         error = level_error(curve, at, &size);
         if (fabs(error) <= CORRECTED * size)
             return 1;
-        level_gradient(curve, at, gradient);
-        slope = square(gradient[0]) + square(gradient[1]);
-        floor = 64.0 * CORRECTED * larger(size, curve->plane->I_max * sqrt(slope)); /* of a flux that nearly cancels */
-        if (!(fabs(error) < before && slope > 0.0))
-            break;
-        before = fabs(error);
-        pmsm_plane_at(curve->plane, at->d - error / slope * gradient[0], at->q - error / slope * gradient[1], at);
+        if (fabs(error) < before) {
+            level_gradient(curve, at, gradient);
+            slope = square(gradient[0]) + square(gradient[1]);
+            floor = 64.0 * CORRECTED * larger(size, curve->plane->I_max * sqrt(slope)); /* of flux that nearly cancels */
+            if (!(slope > 0.0))
+                break;
+            from = *at;
+            before = fabs(error);
+            step_d = -error / slope * gradient[0];
+            step_q = -error / slope * gradient[1];
+        } else {
+            if (fabs(error) <= floor)
+                break;
+            step_d *= 0.5;
+            step_q *= 0.5;
+        }
+        pmsm_plane_at(curve->plane, from.d + step_d, from.q + step_q, at);
     }
     return fabs(error) <= floor; /* rounding, else divergence */
 }
