@@ -46,6 +46,8 @@ def without_table(params: ParameterSet) -> ParameterSet:
 def hunt(steps: Steps, params: ParameterSet, count: int, hold_s: float) -> float:
     """Return the largest swing of the current (A peak to peak) over the last tenth of ``hold_s``."""
     worst = 0.0
+    unheated = {"protection.I_cont_apk": params.values["motor.I_max_apk"]}  # the thermal budget would cut the request
+    params = replace(params, values={**params.values, **unheated})
     for k in range(count):
         rpm, start, target = steps.draw(reachable=False)
         if k % 4 and rpm * target[1] > 0.0:
