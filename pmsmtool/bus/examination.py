@@ -203,6 +203,8 @@ def _timing(connection: Connection, node: int) -> tuple[str, str]:
             times.append(connection.clock.now() - started)
     finally:
         channel.close()
+    if channel.contradiction:
+        return "FAIL", f"node {node}: two nodes answer on this id, {channel.contradiction}: give each drive its own"
     if lost:
         return "FAIL", (
             f"node {node}: {lost} of {lost + len(times)} requests without an answer: frames get lost; {TERMINATION}; "

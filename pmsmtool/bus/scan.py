@@ -45,7 +45,8 @@ def find_nodes(connection: Connection) -> list[FoundNode]:
 
     def answered(cob_id: int, data: bytes, timestamp: float) -> None:
         if data[1:4] == _DEVICE_TYPE_REQUEST[1:4]:
-            types[cob_id - 0x580] = int.from_bytes(data[4:8], "little") if data[0] & 0xE0 == 0x40 else None
+            told = int.from_bytes(data[4:8], "little") if data[0] & 0xE0 == 0x40 else None
+            types[cob_id - 0x580] = types.get(cob_id - 0x580) if told is None else told
 
     def beat(cob_id: int, data: bytes, timestamp: float) -> None:
         if data and data[0] & 0x7F in set(NmtState):

@@ -9,6 +9,7 @@ import can
 import pytest
 
 from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.examination import examine
 from pmsmtool.bus.sdo import LATEST_S, SdoChannel
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.errors import BusError, DriveTimeout
@@ -139,3 +140,19 @@ def test_channel_without_a_node_has_nothing_to_compare(slave: Altered) -> None:
         channel.connection.bus.deliver(0x580 + NODE, b"\x43\x10\x20\x02\x09\x09\x09\x09")  # type: ignore[attr-defined]
         assert channel.read(*NUMBER) == b"\1\2\3\4"
         assert (channel.contradiction, channel.discarded) == ("", 1)
+
+
+@pytest.mark.parametrize("second", SECOND)
+def test_an_examination_tells_two_nodes_on_one_id(slave: Altered, second: str) -> None:
+    then = SECOND[second]
+    slave.then = lambda request, answer: then(request, answer) if request[1:3] == b"\x00\x10" else [answer]
+    with Connection(ScriptedBus(slave)) as connection:
+        found = examine(connection, None, listen_s=0.1)
+    told = [text for verdict, text in found.findings if verdict == "FAIL"]
+    if second == "refuses first":  # its answers to this object are the same
+        assert told == []
+    else:
+        assert (
+            len(told) == 1
+            and f"node {NODE}: two nodes answer on this id, an answer for 0x1000:00 came twice" in told[0]
+        )
