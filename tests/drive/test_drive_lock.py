@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import getpass
 import os
 import random
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -38,6 +40,32 @@ def test_second_is_told_who_until_the_first_ends(tmp_path: Path, monkeypatch: py
     claim(connection(monkeypatch, 43), NODE)
     first.close()
     claim(second, NODE)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("long", [False, True])
+def test_the_owner_of_a_lock_is_named_by_process_user_time_and_command(
+    known: bool, long: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On one line, of 200 letters at most, whatever stands in the command."""
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["/opt/bin/pmsmtool", "jog", "--for\n", "x" * 300 if long else "2s"])
+
+    def user() -> str:
+        if known:
+            return "ada"
+        raise KeyError("no such user")
+
+    monkeypatch.setattr(getpass, "getuser", user)
+    claim(connection(monkeypatch, 42), NODE)
+    with pytest.raises(SecondMaster) as caught:
+        claim(connection(monkeypatch, 42), NODE)
+    head, _, owner = caught.value.what.partition("works with this drive: ")
+    assert head == "another pmsmtool "
+    who = "ada" if known else "an unknown user"
+    told = re.fullmatch(rf"process {os.getpid()} of {who} since \d{{4}}-\d\d-\d\d \d\d:\d\d:\d\d: (.*)", owner)
+    assert told is not None and told[1].startswith("pmsmtool jog --for")
+    assert (len(owner) == 200 + owner.count("\\n")) if long else told[1].endswith("2s")
 
 
 def test_drives_without_a_serial_number_are_told_apart_by_their_place(

@@ -182,6 +182,7 @@ TURNED = {motion.POLARITY: 0x80}
         ({**COUNTS, **GEAR}, "a gear of 2.5 is set"), ({**COUNTS, motion.GEAR_SHAFT: 4}, "a gear of 0.25 is set"),
         ({**COUNTS, **FEED}, 2400.0), ({**COUNTS, **FEED, **GEAR}, 960.0), ({**COUNTS, **FEED, **TURNED}, -2400.0),
         ({**COUNTS, motion.FEED: 1, **GEAR}, "a gear of 2.5"), ({**COUNTS, motion.FEED: 0}, 4096.0),
+        ({**COUNTS, motion.FEED: 2}, "2 units of position"),
         ({**COUNTS, motion.FEED: 7200, motion.FEED_TURNS: 0}, 7200.0), ({motion.FEED: 7200}, 7200.0),
         ({motion.POSITION_UNIT: 0x00410000}, 360.0), ({motion.POSITION_UNIT: 0xFD410000, **COUNTS}, 360e3),
         ({motion.POSITION_UNIT: 0x01410000, **TURNED}, -36.0), ({motion.POSITION_UNIT: 0xFD410000, **GEAR}, 144e3),

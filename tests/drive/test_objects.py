@@ -7,7 +7,7 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from pmsmtool.drive import objects
+from pmsmtool.drive import motion_objects, objects, set_point, standard_drive, torque_drives
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Recording, Shape
 from pmsmtool.resources import data_folder
@@ -108,6 +108,35 @@ def test_addresses_of_texts_domains_and_records() -> None:
     assert {name: getattr(objects, name) for name in OTHER_ADDRESSES} == OTHER_ADDRESSES
     for group in NUMBERED:
         assert len(getattr(objects, group)) == 8
+
+
+OF_THE_STANDARD = {
+    motion_objects.ENCODER_COUNTS: (0x608F, 1, "I"), motion_objects.MOTOR_TURNS: (0x608F, 2, "I"),
+    motion_objects.POSITION: (0x6064, 0, "i"), motion_objects.MAX_TORQUE_PERMILLE: (0x6072, 0, "H"),
+    motion_objects.TORQUE_PERMILLE: (0x6077, 0, "h"), motion_objects.POLARITY: (0x607E, 0, "B"),
+    motion_objects.GEAR_MOTOR: (0x6091, 1, "I"), motion_objects.GEAR_SHAFT: (0x6091, 2, "I"),
+    motion_objects.FEED: (0x6092, 1, "I"), motion_objects.FEED_TURNS: (0x6092, 2, "I"),
+    motion_objects.POSITION_UNIT: (0x60A8, 0, "I"), motion_objects.TORQUE_SLOPE: (0x6087, 0, "I"),
+    motion_objects.PERIOD_VALUE: (0x60C2, 1, "B"), motion_objects.PERIOD_EXPONENT: (0x60C2, 2, "b"),
+    set_point.TARGET_POSITION: (0x607A, 0, "i"), set_point.POSITION_DEMAND: (0x6062, 0, "i"),
+    standard_drive.COMMUTATION_ANGLE: (0x60EA, 0, "H"), torque_drives.DC_LINK_MV: (0x6079, 0, "I"),
+}  # fmt: skip
+
+
+def test_objects_of_motion_are_those_of_the_standard() -> None:
+    """CiA 402-2 by clause; most of them the reference drive has not."""
+    for item, address in OF_THE_STANDARD.items():
+        assert (item.index, item.sub, item.letter) == address
+
+
+@pytest.mark.parametrize(
+    ("letter", "length", "other"),
+    [("H", 4, "I"), ("h", 4, "i"), ("I", 2, "H"), ("i", 1, "b"), ("B", 8, "Q"), ("H", 2, "H"), ("H", 3, None),
+     ("f", 4, "f"), ("f", 2, None), ("H", 0, None)],
+)  # fmt: skip
+def test_a_whole_number_in_another_width(letter: str, length: int, other: str | None) -> None:
+    found = DriveObject(0x6075, 3, letter).of_length(length)
+    assert found == (None if other is None else DriveObject(0x6075, 3, other))
 
 
 @pytest.mark.parametrize(
