@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from pmsmtool.bus.abort_codes import BUSY_CODES
 from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -13,6 +14,8 @@ _MARKS: tuple[_Object, ...] = tuple(
     (mark.index, mark.sub) for mark in (objects.CONFIGURATION_DATE, objects.CONFIGURATION_TIME)
 )
 """Cleared by every change of another object."""
+BUSY_S, BUSY_POLL_S = 5.0, 0.1
+"""A drive that refuses because it is busy is asked again for so long, and so often."""
 
 
 class ChangedObjects:
@@ -47,8 +50,23 @@ class ChangedObjects:
         ------
         VerifyMismatch
             An object does not hold its old content; each is named.
+        SdoAbort
+            The drive refuses it, for being busy longer than ``BUSY_S``.
         """
         self._node.before_write = None
+        clock = self._node.connection.clock
+        until = clock.now() + BUSY_S
+        back: set[_Object] = set()
+        while True:
+            try:
+                self._bring_back(back)
+                return len(back)
+            except SdoAbort as abort:
+                if abort.code not in BUSY_CODES or clock.now() >= until:
+                    raise
+            self._node.connection.wait(BUSY_POLL_S)
+
+    def _bring_back(self, back: set[_Object]) -> None:
         drive_map = self._node.map
         staged = (*drive_map.cells, *drive_map.tables) if drive_map.staging else ()
         names = {drive_map.address(name): name for name in staged}
@@ -58,17 +76,19 @@ class ChangedObjects:
         lines = []
         if changed:
             self._drive.replace(changed)
-        back = len(changed)
+            back |= {drive_map.address(name) for name in changed}
         for (index, sub), data in reversed(others.items()):  # the marks, which were noted first, last
             try:
                 if self._read(index, sub) != data:
                     self._node.sdo.download(index, sub, data)
-                    back += 1
+                    back.add((index, sub))
                 if self._read(index, sub) != data:
                     lines.append(f"0x{index:04X}:{sub:02X} does not hold {data[:8].hex(' ')} again")
             except SdoAbort as abort:
                 if index == objects.MODE.index:
                     continue  # the mode a drive wakes up with, which some take from nobody; it is off by now
+                if abort.code in BUSY_CODES:
+                    raise
                 lines.append(f"0x{index:04X}:{sub:02X}: {abort.what}")
         if lines:
             raise VerifyMismatch(
@@ -77,7 +97,6 @@ class ChangedObjects:
                 differences=lines,
                 hint="reset the drive: it comes back with what it has stored",
             )
-        return back
 
     def _note(self, index: int, sub: int) -> None:
         if (index, sub) not in self._before:

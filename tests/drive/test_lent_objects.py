@@ -25,7 +25,7 @@ from pmsmtool.drive.own_limits import LEAST_COUNTS, lower_limits, put_limit
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.process_data import LiveValues, live_values, sent_every_s
 from pmsmtool.drive_maps.shipped_maps import load_family
-from pmsmtool.errors import BusError, NotAvailable, SafetyRefusal, VerifyMismatch
+from pmsmtool.errors import BusError, NotAvailable, SafetyRefusal, SdoAbort, VerifyMismatch
 from tests.bus.scripted import NODE
 from tests.drive.table_drive import Held, TableDrive, node_of
 
@@ -378,6 +378,25 @@ def test_an_object_that_refuses_its_old_value_is_named_but_for_the_mode(item: Dr
         with pytest.raises(VerifyMismatch) as caught:
             changed.restore()
         assert caught.value.differences[0].startswith(named) and len(caught.value.differences) == 1
+
+
+@pytest.mark.parametrize(("code", "busy_s", "comes_back"), [(0x08000021, 4.5, True), (0x08000022, 9.0, False)])
+def test_a_busy_drive_is_asked_again_for_its_old_values(code: int, busy_s: float, comes_back: bool) -> None:
+    """It had been left with lowered limits where it was busy for an instant."""
+    with node_of({A: 5, B: 6}, GENERIC) as (table, node):
+        changed = changed_of(node)
+        changed.begin()
+        node.put(A, 50)
+        node.put(B, 60)
+        table.fixed[A.index, 0] = code
+        table.bus.clock.after(busy_s, table.fixed.clear)
+        if comes_back:
+            assert changed.restore() == 2 and (table.number(A), table.number(B)) == (5, 6)
+            assert busy_s < node.connection.clock.now() < busy_s + 0.2
+        else:
+            with pytest.raises(SdoAbort):
+                changed.restore()
+            assert node.connection.clock.now() < 5.3 and table.number(B) == 6, "the others came back"
 
 
 def test_an_object_that_takes_its_old_value_and_does_not_keep_it() -> None:

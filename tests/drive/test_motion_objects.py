@@ -290,3 +290,10 @@ def test_what_the_drive_does_not_keep_by_itself_is_told(held: Held, told: list[s
     assert [line.split()[0] for line in lines] == [text.split()[0] for text in told]
     for line, text in zip(lines, told, strict=True):
         assert all(part in line for part in text.partition(" ")[2].split(": ") if part)
+
+
+def test_a_drive_that_announces_no_mode_has_none() -> None:
+    with drive(TORQUE) as node:
+        for asked in (lambda: motion.torque_target(node, 10.0), lambda: motion.limited_speed(node)):
+            with pytest.raises(NotAvailable, match=r"0x6502 = 0x0\)"):
+                asked()
