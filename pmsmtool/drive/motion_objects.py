@@ -53,6 +53,9 @@ above what the tool's own look sees first, so that the limit is named."""
 TRIP_LEAST = 0.25
 """Smallest speed for it, of the trip that the drive holds: a rotor that aligns with a vector is fast for a moment."""
 TORQUE_SLOPE = DriveObject(0x6087, 0, "I")
+LENT_SLOPE = 100_000
+"""Permille per second that a drive is lent where its own slope is slow: a tenth of the rated torque per ms, as this
+program ramps what has no slope (bench safety: no command rises faster)."""
 SLOW_SLOPE_S = 0.5
 """Time to the rated torque from which a slope of the drive's own leaves nothing of a push: the shortest lasts 40 ms. As
 stored, one maker's drive takes 10 s; others take no time (0), or 0.1 ms."""
@@ -210,6 +213,26 @@ def cyclic_period_s(node: DriveNode, wanted_s: float) -> float:
     return node.get(PERIOD_VALUE) * 10.0 ** (-3 if exponent is None else exponent)
 
 
+def quicken_slope(node: DriveNode) -> None:
+    """Lend the drive a slope for its torque that leaves something of a push, where its own does not.
+
+    Raises
+    ------
+    NotAvailable
+        The drive keeps its slow one: a push would take seconds, and turn the shaft on and on.
+    """
+    if not slow_slope_s(node):
+        return
+    with contextlib.suppress(SdoAbort):
+        node.put(TORQUE_SLOPE, LENT_SLOPE)
+    slow_s = slow_slope_s(node)
+    if slow_s:
+        raise NotAvailable(
+            f"the drive takes {slow_s:.3g} s to its rated torque, and refuses a faster slope",
+            where=f"node {node.node}, 0x6087", hint="raise 0x6087 with the maker's software",
+        )  # fmt: skip
+
+
 def slow_slope_s(node: DriveNode) -> float:
     """Return the time (s) that the drive's slope takes to its rated torque where it is too long for a push, else 0."""
     slope = node.held(TORQUE_SLOPE) or math.inf  # permille per second; 0 is none
@@ -340,6 +363,6 @@ def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
     slope_s = slow_slope_s(node)
     if slope_s:
         cyclic = bool(int(node.held(objects.SUPPORTED_MODES) or 0) >> Mode.CYCLIC_TORQUE - 1 & 1)
-        told = "mode 10 ignores it, and this program ramps" if cyclic else "torque pulses are slow, or impossible"
+        told = "mode 10 ignores it, and this program ramps" if cyclic else "raised for the pulses, and restored"
         lines.append(f"slope     {slope_s:.3g} s to the rated torque in mode 4 (0x6087): {told}")
     return lines

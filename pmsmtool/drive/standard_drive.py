@@ -24,6 +24,7 @@ from pmsmtool.drive.motion_objects import (
     TorqueTarget,
     cyclic_period_s,
     position_units,
+    quicken_slope,
     rated_apk,
     shown_current,
     torque_target,
@@ -198,6 +199,8 @@ class TorqueCurrent(CanopenDrive):
         self._asked_a = 0.0
         if self.target.cyclic:
             self._step_s = max(STEP_S, cyclic_period_s(self.node, STEP_S))
+        elif self.target.mode == Mode.PROFILE_TORQUE:
+            quicken_slope(self.node)
         self._set_mode(self.target.mode)
         self.may_be_energised = True
         self.node.enable()

@@ -22,7 +22,7 @@ from pmsmtool.cia402 import State
 from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import WATCH_S, guarded
-from pmsmtool.drive.motion_objects import position_units, watched_by_tool
+from pmsmtool.drive.motion_objects import LENT_SLOPE, position_units, watched_by_tool
 from pmsmtool.drive.torque_drives import SpeedPushDrive, TorqueDrive, pushing_drive
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import family_of, load_family
@@ -269,6 +269,28 @@ def test_a_cyclic_torque_is_not_held_back_by_the_slope(tmp_path: Path) -> None:
         assert rig.drive.live("i_q_a") > 1.0
         assert rig.face.behind is not None and rig.face.behind.largest_step <= 0.101
         assert rig.number(0x6087) == 100, "what the drive holds is left alone"
+
+
+def test_a_slow_slope_of_the_torque_mode_is_lent_a_faster_one(tmp_path: Path) -> None:
+    """Mode 4 alone: two amperes within 60 ms, which would take 3 s; then the slope is the drive's again."""
+    with opened(tmp_path, (*epos4(0x2D), *SLOPE)) as rig:
+        with guarded(rig.drive, ENVELOPE) as guard:
+            guard.enable()
+            assert rig.number(0x6087) == LENT_SLOPE
+            guard.command_current(0.0, 2.0)
+            guard.wait(0.06)
+            assert rig.drive.live("i_q_a") > 1.0
+        assert rig.number(0x6087) == 100
+
+
+def test_a_slope_that_stays_slow_is_refused_before_anything_is_energised(tmp_path: Path) -> None:
+    rows = (*epos4(0x2D), (0x6087, 0, "U32", "ro", "100"))
+    with (
+        opened(tmp_path, rows) as rig,
+        pytest.raises(NotAvailable, match="10 s to its rated torque"),
+        guarded(rig.drive, ENVELOPE) as guard,
+    ):
+        guard.enable()
 
 
 def test_a_drive_without_torque_mode_has_no_target(tmp_path: Path) -> None:

@@ -239,3 +239,10 @@ def test_a_gain_that_the_drive_lacks_is_asked_for_by_its_address(tool: Tool) -> 
     channel = "interior-2k2?nv=:memory:&eds=x.eds"
     code, _, said = tool("--sim", channel, "--yes", "map", "learn", "--machine", profile)
     assert code == 9 and "the drive has no such object" in said and "=0xINDEX:SUB" in said
+
+
+@pytest.mark.chain
+def test_a_slow_slope_of_a_healthy_drive_is_no_wiring(tool: Tool) -> None:
+    """200 permille per second, mode 4 alone: 'check' named an open phase, and 'identify' ended after 600 s."""
+    code, verdicts, said = checked(tool, unknown("0x2D", (0x6087, 0, "U32", "rw", "200")))
+    assert code == 10 and verdicts["shaft"] == "ok", said
