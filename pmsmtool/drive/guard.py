@@ -123,6 +123,11 @@ class GuardedDrive:
         if prove:
             self.proof = prove_dead_man(self._drive, self._heartbeat)
 
+    @property
+    def refused_limits(self) -> tuple[str, ...]:
+        """Limits that the drive does not let be lowered, one line each."""
+        return self._limits.refused
+
     def _refuse_unwatched(self) -> None:
         """Refuse a limit that cannot be watched on this drive."""
         if math.isfinite(self.envelope.energy_j) and not self._R_s_ohm > 0.0:
@@ -512,8 +517,8 @@ def guarded(
     try:
         try:
             guard.begin(prove=prove, first=first)
-            if guard.proof is not None:
-                say(str(guard.proof))
+            for line in (*guard.refused_limits, *((str(guard.proof),) if guard.proof is not None else ())):
+                say(line)
             yield guard
         except KeyboardInterrupt:
             interrupted = True

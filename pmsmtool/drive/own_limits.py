@@ -31,12 +31,15 @@ class OwnLimits(NamedTuple):
         The objects in use, None where the drive has none.
     most_apk, most_rpm : float
         What they allow after they were lowered to the envelope (A peak, rpm).
+    refused : tuple of str
+        Limits that the drive does not let be lowered, one line each.
     """
 
     current: Quantity | None
     speed: Quantity | None
     most_apk: float
     most_rpm: float
+    refused: tuple[str, ...] = ()
 
 
 NO_LIMITS = OwnLimits(None, None, math.inf, math.inf)
@@ -58,8 +61,9 @@ def lower_limits(drive: CanopenDrive, envelope: Envelope) -> OwnLimits:
     node = drive.node
     rated = rated_apk(node)
     _refuse_no_limit(node, rated, envelope.i_max_apk)
-    current = _lowered(node, current_limits(node, rated), envelope.i_max_apk)
-    speed = _lowered(node, speed_limits(node), rpm_from_rad_s(envelope.speed_max_rad_s))
+    refused: list[str] = []
+    current = _lowered(node, current_limits(node, rated), envelope.i_max_apk, refused)
+    speed = _lowered(node, speed_limits(node), rpm_from_rad_s(envelope.speed_max_rad_s), refused)
     if not (current and speed) and not drive.commands_bounded_current:
         raise NotAvailable(
             "the drive has no current and speed limit of its own (0x6073, 0x6075, 0x6080)",
@@ -71,6 +75,7 @@ def lower_limits(drive: CanopenDrive, envelope: Envelope) -> OwnLimits:
         None if speed is None else speed[0],
         math.inf if current is None else current[1],
         math.inf if speed is None else speed[1],
+        tuple(refused),
     )
 
 
@@ -104,18 +109,28 @@ def _refuse_no_limit(node: DriveNode, rated: float, i_max: float) -> None:
         )
 
 
-def _lowered(node: DriveNode, limits: Iterator[Quantity], wanted: float) -> tuple[Quantity, float] | None:
-    """Lower the drive's own limit to what is wanted and return it with what it allows (A peak or rpm)."""
-    found = allowed(node, limits)
-    if found is None:
-        return None
-    limit, now = found
-    # Rounded up: a permille of the rated current must not cut what the envelope allows.
-    counts = math.ceil(wanted / limit.per_count)
-    if counts * limit.per_count >= now:
-        return found
-    _put(node, limit, counts)
-    return limit, counts * limit.per_count
+def _lowered(
+    node: DriveNode, limits: Iterator[Quantity], wanted: float, refused: list[str]
+) -> tuple[Quantity, float] | None:
+    """Lower the drive's own limit to what is wanted and return it with what it allows (A peak or rpm).
+
+    The next one is tried where the drive refuses to: a limit that nobody can lower counts as none.
+    """
+    for limit in limits:
+        found = allowed(node, iter((limit,)))
+        if found is None:
+            continue
+        # Rounded up: a permille of the rated current must not cut what the envelope allows.
+        counts = math.ceil(wanted / limit.per_count)
+        if counts * limit.per_count >= found[1]:
+            return found
+        try:
+            _put(node, limit, counts)
+        except SdoAbort as abort:
+            refused.append(f"limit {limit} stays at what the drive holds ({abort.what}): this program looks instead")
+            continue
+        return limit, counts * limit.per_count
+    return None
 
 
 def _put(node: DriveNode, limit: Quantity, counts: int) -> None:

@@ -293,6 +293,16 @@ def test_a_slope_that_stays_slow_is_refused_before_anything_is_energised(tmp_pat
         guard.enable()
 
 
+def test_a_limit_that_cannot_be_lowered_is_named_and_watched_here(tmp_path: Path) -> None:
+    """0x6080 that only reports: the speed may not even overshoot, as without one."""
+    rows = (*(row for row in epos4() if row[0] != 0x6080), (0x6080, 0, "U32", "ro", "6000"))
+    said: list[str] = []
+    with opened(tmp_path, rows) as rig, guarded(rig.drive, ENVELOPE, say=said.append) as guard:
+        assert guard.refused_limits and guard.refused_limits[0] in said
+        assert "0x6080" in said[0] and "this program looks instead" in said[0]
+        assert guard._limits.speed is None and guard._limits.current is not None
+
+
 def test_a_drive_without_torque_mode_has_no_target(tmp_path: Path) -> None:
     with opened(tmp_path, epos4(0x25)) as rig, pytest.raises(NotAvailable, match="0x6502 = 0x25"):
         rig.drive.command_current(0.0, 1.0)

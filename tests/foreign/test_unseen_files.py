@@ -241,6 +241,17 @@ def test_a_gain_that_the_drive_lacks_is_asked_for_by_its_address(tool: Tool) -> 
     assert code == 9 and "the drive has no such object" in said and "=0xINDEX:SUB" in said
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "kept"), [(65535, 0, (None, None)), (0, 0, (None, None)), (7, 7, (7, 7)), (0, 9, (0, 9))]
+)
+def test_limits_the_wrong_way_round_say_nothing(
+    tmp_path: Path, low: int, high: int, kept: tuple[int | None, int | None]
+) -> None:
+    path = write_eds(tmp_path / "x.eds", unknown(), {(0x6073, 0): (low, high)})
+    row = read_makers_objects(str(path)).rows[0x6073, 0]
+    assert (row.low, row.high) == kept
+
+
 @pytest.mark.chain
 def test_a_slow_slope_of_a_healthy_drive_is_no_wiring(tool: Tool) -> None:
     """200 permille per second, mode 4 alone: 'check' named an open phase, and 'identify' ended after 600 s."""

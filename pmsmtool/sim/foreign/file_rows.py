@@ -195,7 +195,7 @@ def _row(
 ) -> ObjectRow:
     access = _ACCESS.get(access, "ro")
     if low is not None and high is not None and not low < high and access == "rw":
-        low = high = None if low == high == 0 else low  # both 0: the file's way to say nothing
+        low = high = None if low > high or low == 0 else low  # the wrong way round, or both 0: it says nothing
     kept = access == "rw" and index not in NOT_KEPT
     mapped = "R" if access in ("rw", "wo") else "T"  # the files' own word for it is often missing
     return ObjectRow(index, sub, "", name, kind, access, mapped, "", _value(value, kind), low, high, kept)
