@@ -220,9 +220,9 @@ def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
     sizes = _Sizes.of(design, conditions)
     experiments: list[Experiment] = []
     left_out: list[str] = []
-    turning, play = sizes.turns, _play(design)
-    if turning and play:
-        left_out.append(f"speed step, field weakening: {play}")
+    turning, unmodelled = sizes.turns, _unmodelled(design)
+    if turning and unmodelled:
+        left_out.append(f"speed step, field weakening: {unmodelled}")
     elif turning:
         experiments.append(_speed_step(sizes))
     else:
@@ -230,7 +230,7 @@ def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
         left_out.append(f"speed step, field weakening, unreachable reference: {why}; current steps at standstill")
     experiments += [_current_steps(sizes, "q"), _current_steps(sizes, "d")]
     if turning:
-        for make in (_unreachable,) if play else (_unreachable, _weakening):
+        for make in (_unreachable,) if unmodelled else (_unreachable, _weakening):
             found = make(sizes)
             if isinstance(found, Experiment):
                 experiments.append(found)
@@ -315,11 +315,15 @@ def _generation_rpm(design: Design) -> float:
     return math.inf if protected else float(design.facts.get("generation_rpm", math.inf))
 
 
-def _play(design: Design) -> str:
-    """Return why no response of the speed loop is predicted; empty where identification saw no play."""
-    inertia = design.machine.estimates.get("J_kgm2")
-    known = inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK)
-    return "the shaft has play, which nothing predicts" if known else ""
+def _unmodelled(design: Design) -> str:
+    """Return why no response of the speed loop is predicted; empty where identification says how the shaft moves."""
+    machine = design.machine
+    inertia = machine.estimates.get("J_kgm2")
+    if inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK):
+        return "the shaft has play, which nothing predicts"
+    if machine.conditions.get(SHOWN, RIGID) not in (RIGID, NOTHING) and machine.machine.resonance_hz is None:
+        return "the shaft is not rigid, and no resonance tells how: play, or an elastic coupling with much damping"
+    return ""
 
 
 def _speed_step(s: _Sizes) -> Experiment:
@@ -455,8 +459,8 @@ def _moves(s: _Sizes, increments: int) -> tuple[Experiment, ...] | str:
     K_p, slope = s.design["position.K_p_per_s"], s.design["speed.acceleration_rpm_per_s"] * RPM
     if K_p <= 0.0:
         return "position moves: the design has no position controller"
-    if play := _play(s.design):
-        return f"position moves: {play}"
+    if unmodelled := _unmodelled(s.design):
+        return f"position moves: {unmodelled}"
     machine = s.design.machine
     shown, J = machine.conditions.get(SHOWN, RIGID), machine.estimates.get("J_kgm2")
     bent = J is not None and J.fallback.startswith((ELASTIC_FALLBACK, MEAN_FALLBACK))

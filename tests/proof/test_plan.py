@@ -92,6 +92,17 @@ def test_of_a_shaft_with_play_only_currents_are_predicted() -> None:
     assert "speed step, field weakening: the shaft has play, which nothing predicts" in plan.left_out
 
 
+def test_of_a_shaft_that_bends_in_a_way_that_nothing_tells_only_currents_are_predicted() -> None:
+    """0.67 degrees of play beside Stribeck friction: no resonance, and a healthy speed step at 1.08 of its band."""
+    made = shown(design(), "elastic")
+    plan = plan_proof(made, conditions(made))
+    assert [e.name for e in plan.experiments] == ["q_steps", "d_steps", "unreachable"]
+    assert any(line.startswith("speed step, field weakening: the shaft is not rigid") for line in plan.left_out)
+    known = replace(made.machine.machine, resonance_hz=200.0, antiresonance_hz=100.0, resonance_zeta=0.02)
+    told = replace(made, machine=replace(made.machine, machine=known))
+    assert "speed_step" in [e.name for e in plan_proof(told, conditions(made)).experiments]
+
+
 def test_a_shaft_that_is_shown_to_be_rigid_is_moved() -> None:
     made = design()
     plan = plan_proof(shown(made, RIGID), conditions(made))
