@@ -14,7 +14,7 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.cross_check import cross_check
-from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_instant_s
 from pmsmtool.estimators.injection.switching_ripple import Modulation
@@ -38,6 +38,8 @@ MEAN_FALLBACK = "mean acceleration of torque pulses on a shaft that is not rigid
 PLAY_FALLBACK = "torque pulses on a shaft with play, of which a small torque turns a part"
 PLAY_LEAST = 0.05
 """Share of the inertia that a small torque must leave unmoved before it counts as play."""
+FINER = 2.0
+"""Interval of the inertia by pulses, of the one by a small torque, from which on the latter stands."""
 SATURATION_DOUBT = 0.25
 """Relative standard deviation of the torque without a flux map, of the curvature of psi_d over i_d: the flux that a q
 current takes from the d axis is not seen. The saturated profile has a curvature of 3 % and its J was 0.77 % off."""
@@ -202,11 +204,16 @@ def of_no_rigid_shaft(
 
 
 def with_play_told(found: MechanicsResult, response: FrequencyResponse | None) -> MechanicsResult:
-    """Return what pushes tell, its inertia saying so where a small torque turns less of the shaft: it has play."""
+    """Return what pushes tell, its inertia saying so where a small torque turns less of the shaft: it has play.
+
+    Where both agree, and the pushes turned a coarse encoder by few steps, the inertia is that of the small torque.
+    """
     small = None if response is None else response.inertia
     if small is None:
         return found
     check = cross_check("J_kgm2", "J_kgm2", small, found.J)
+    if check.agrees and FINER * total_half_width(small) < total_half_width(found.J):
+        return replace(found, J=small)
     if check.agrees or check.difference > -PLAY_LEAST:
         return found
     both = f"{small.value:.3g} kg m2 by a small torque, {found.J.value:.3g} by pulses"

@@ -14,12 +14,15 @@ from benchmarks.mechanics_accuracy import realisation
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import CHI2_WARN
 from pmsmtool.estimators.shaft.mechanics import estimate_mechanics
+from pmsmtool.estimators.shaft.motion import positions
 from pmsmtool.estimators.shaft.position import encoder_step, position_std, rounding_rad
 from pmsmtool.trace import Trace
 
 STEP_LIMIT = 0.01
 """Measured on these: 3e-6 at most; the smallest second difference alone is off by up to 0.13."""
 
+COARSE_LIMIT = 0.1
+"""Deviation of J at 60 and 140 steps; see there for what was measured."""
 WIDER = 1.1
 """Growth of the fit's deviations by binary32; measured 1.01."""
 
@@ -92,3 +95,31 @@ def single(trace: Trace) -> Trace:
     """Return the trace as a recorder carries it, in binary32."""
     theta = trace["theta_M_rad"].astype(np.float32).astype(np.float64)
     return replace(trace, signals={**trace.signals, "theta_M_rad": theta})
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("steps", [60.0, 140.0])
+def test_few_steps_of_a_coarse_encoder_leave_a_wide_interval_that_holds_the_truth(steps: float) -> None:
+    """A direct drive for 165 rpm, 11 bits: its pulses turn by 73 steps, and J was refused below 200."""
+    rng, off = np.random.default_rng(8), []
+    per_a, current, unit, step = 0.9, 4.0, 0.2, 2.0 * math.pi / 2**11
+    speed = 2.0 * steps * step / unit
+    J, B, tau_c = per_a * current * unit / speed, 0.01 * per_a * current / speed, 0.02 * per_a * current
+    for _ in range(8):
+        traces, omega = [], 0.0
+        for i, seconds in ((current, unit), (0.0, 6.0 * unit), (-current, 2.0 * unit), (0.0, 6.0 * unit)):
+            rows = 1000
+            T = seconds / rows
+            theta = positions(np.full(rows, per_a * i), T, np.array([math.log(J), B, tau_c, 0.0, omega]))
+            omega = float(theta[-1] - theta[-2]) / T
+            signals = {
+                "i_d_a": np.zeros(rows + 1),
+                "i_q_a": i + 0.02 * rng.standard_normal(rows + 1),
+                "theta_M_rad": step * np.round((theta + rng.uniform(0.0, step)) / step),
+                "flagged": np.zeros(rows + 1),
+            }
+            traces.append(Trace(T * np.arange(rows + 1.0), signals, dict.fromkeys(signals, "1"), {"coasting": not i}))
+        found = estimate_mechanics(traces, lambda i_d, i_q: per_a * i_q, per_a, 0.02, 0.0)
+        off.append([(v.value - t) / v.std for v, t in zip((found.J, found.B, found.tau_c), (J, B, tau_c), strict=True)])
+        assert found.J.std < COARSE_LIMIT * J
+    assert float(np.max(np.abs(off))) < 3.0, off

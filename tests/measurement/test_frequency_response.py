@@ -222,6 +222,17 @@ def test_pushes_that_a_rigid_shaft_explains_show_play_where_a_small_torque_turns
         assert with_play_told(rigid, other) is rigid
 
 
+def test_the_inertia_by_a_small_torque_stands_where_pulses_of_few_encoder_steps_leave_it_wide() -> None:
+    """73 steps of 11 bits in a pulse: J to 4.9 % by it, to 2.9 % by the random torque."""
+    nothing = np.zeros(0)
+    response = FrequencyResponse(nothing, nothing.astype(complex), nothing, nothing, 800.0, 1.0, 1.0, 0.0,
+                                 inertia=Estimate(5.5e-3, 4e-5, 0.0, "kg m2"))  # fmt: skip
+    pulses = Pushed(5.63e-3, 0.0).mechanics()
+    wide = replace(pulses, J=replace(pulses.J, std=0.05 * pulses.J.value))
+    assert with_play_told(wide, response).J is response.inertia and with_play_told(wide, response).B is wide.B
+    assert with_play_told(pulses, response) is pulses
+
+
 def test_no_notch_without_a_resonance_and_none_beyond_the_speed_controller() -> None:
     rigid = load_machine_file(machine_path("interior-2k2"))
     assert tune(rigid, TuneRequest())["speed.notch_hz"] == 0.0
