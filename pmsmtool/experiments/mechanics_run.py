@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
+from pmsmtool.estimators.shaft.mechanics import POWERED
 from pmsmtool.experiments.signals import readable
 from pmsmtool.experiments.speed_run import reach
 from pmsmtool.trace import Trace
@@ -136,7 +137,7 @@ def _parts(whole: Trace, i_q_a: float, push_s: float) -> tuple[Trace, Trace]:
         replace(whole, t_s=whole.t_s[part] - whole.t_s[part][0], signals={n: whole[n][part] for n in whole.signals})
         for part in (slice(0, ends[0]), slice(ends[1], None))
     )
-    return push, replace(coasting, meta={**whole.meta, "coasting": True})
+    return push, replace(coasting, meta={**whole.meta, "coasting": True, POWERED: True})
 
 
 def _speed(trace: Trace, *, first_rows: bool = False) -> float:

@@ -19,7 +19,7 @@ from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_instant_s
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR
-from pmsmtool.estimators.shaft.mechanics import MechanicsResult, Torque, estimate_mechanics, mean_inertia
+from pmsmtool.estimators.shaft.mechanics import POWERED, MechanicsResult, Torque, estimate_mechanics, mean_inertia
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
 from pmsmtool.trace import Trace
@@ -66,6 +66,8 @@ class Pushes:
         Sign of the encoder's count along the phase order, and pole pairs.
     tolerance : SensorTolerance or None
         Declared sensor tolerances.
+    drag_std_nms : float
+        What the displacement of the samples may make of B, of a shaft that coasts with the voltage on (N m s).
     """
 
     parts: list[Trace]
@@ -77,6 +79,7 @@ class Pushes:
     direction: int
     pole_pairs: int
     tolerance: SensorTolerance | None
+    drag_std_nms: float = 0.0
 
     def mechanics(self, *, elastic: bool = False) -> MechanicsResult:
         """Return inertia and friction; ``elastic``: take any torque that a rigid shaft does not explain for noise.
@@ -86,7 +89,7 @@ class Pushes:
         IdentificationError
             As the estimator refuses.
         """
-        return estimate_mechanics(
+        found = estimate_mechanics(
             self.parts,
             self.torque,
             self.torque_per_a,
@@ -98,6 +101,7 @@ class Pushes:
             pole_pairs=self.pole_pairs,
             elastic=elastic,
         )
+        return replace(found, B=replace(found.B, std=math.hypot(found.B.std, self.drag_std_nms)))
 
     def inertia(self) -> Estimate | None:
         """Return the inertia alone, of the mean accelerations; None where they tell none."""
@@ -138,12 +142,15 @@ def pushes_of(
     found = result.inductance
     L_h = rough_L_h if found is None else (found.L_d.value, found.L_q.value)
     doubt = SAMPLE_DOUBT if found is not None else 1.0
-    displaced, tilt = 0.0, 0.0
+    displaced, tilt, drag = 0.0, 0.0, 0.0
     for k, part in enumerate(parts):
-        if not part.meta["coasting"]:
+        if not part.meta["coasting"] or part.meta.get(POWERED):
             sampled = in_frame(part, behind)
             parts[k] = _between_samples(sampled, direction * pole_pairs, result, L_h, dead_time_s, period_s)
             before, after = (torque(run["i_d_a"], run["i_q_a"]) for run in (sampled, parts[k]))
+            if part.meta["coasting"]:
+                drag = max(drag, doubt * float(np.mean(np.abs(after - before)) / np.mean(np.abs(_speed(part)))))
+                continue
             fast = np.abs(_speed(part)) > FAST_SHARE * np.max(np.abs(_speed(part)))
             size = float(np.mean(np.abs(before)))
             displaced = max(displaced, abs(float(np.mean(after - before))) / size)
@@ -159,6 +166,7 @@ def pushes_of(
         direction,
         pole_pairs,
         tolerance,
+        drag,
     )
 
 

@@ -322,7 +322,7 @@ def _unmodelled(design: Design) -> str:
     if inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK):
         return "the shaft has play, which nothing predicts"
     if machine.conditions.get(SHOWN, RIGID) not in (RIGID, NOTHING) and machine.machine.resonance_hz is None:
-        return "the shaft is not rigid, and no resonance tells how: play, or an elastic coupling with much damping"
+        return "the shaft is not rigid, and no resonance was found: play, or an elastic coupling with much damping"
     return ""
 
 

@@ -43,6 +43,8 @@ Torque = Callable[[Array, Array], Array]
 """Torque (N m) of arrays of i_d, i_q (A)."""
 
 STAGE = "mechanics"
+POWERED = "powered"
+"""Condition of a coasting with the voltage on: ``i_d_a`` and ``i_q_a`` are its torque."""
 BLOCKS = 250
 """Positions of a trace in the fit; the currents between two are averaged."""
 TRACES_LEAST = 4
@@ -159,7 +161,7 @@ def estimate_mechanics(
     ----------
     runs : sequence of Trace
         ``theta_M_rad`` of pushes and coasting in both directions; of a push ``i_d_a i_q_a flagged``, too, in the frame
-        of the d axis; ``meta["coasting"]``: no torque.
+        of the d axis; ``meta["coasting"]``: no torque, or hardly any (:data:`POWERED`).
     torque : callable
         Torque of the currents, by flux linkage or flux map at the temperature of the run.
     torque_per_a : float
@@ -360,19 +362,23 @@ def _blocks(
 ) -> tuple[Array, Run]:
     """Return a trace's positions, and it in blocks, without the encoder's error.
 
-    Cogging is a torque of the pushes, and out of the way of a coasting: it goes through periods within a block of a
-    coasting, where only the position shows it.
+    A coasting within the record of a push begins with what is left of its current. Cogging is a torque of the pushes,
+    and out of the way of a coasting: it goes through periods within a block of one, where only the position shows it.
     """
     rows = max(1, (len(run) - 1) // BLOCKS)
     count = (len(run) - 1) // rows
     shown = direction * run["theta_M_rad"]
     theta_std = np.maximum(position_std(shown[: count * rows + 1 : rows], step), position_noise(shown))
-    if run.meta["coasting"]:
-        theta = harmonics.shaft(harmonics.without_ripple(run.t_s, shown))[: count * rows + 1]
-        return theta, Run(theta[::rows], np.zeros(count), rows * run.period_s, theta_std, 0.0, True)
-    theta = harmonics.shaft(shown)[: count * rows + 1]
-    tau = torque(run["i_d_a"], run["i_q_a"]) + harmonics.torque_nm(shown, J_kgm2)
+    coasting, powered = bool(run.meta["coasting"]), bool(run.meta.get(POWERED))
+    tau = torque(run["i_d_a"], run["i_q_a"]) if powered or not coasting else np.zeros(len(run))
+    if not coasting:
+        tau = tau + harmonics.torque_nm(shown, J_kgm2)
     mean = (0.5 * (tau[:-1] + tau[1:]))[: count * rows].reshape(count, rows).mean(axis=1)
+    if coasting:
+        theta = harmonics.shaft(harmonics.without_ripple(run.t_s, shown))[: count * rows + 1]
+        noise = abs(torque_per_a) * sigma_a / math.sqrt(rows) if powered else 0.0
+        return theta, Run(theta[::rows], mean, rows * run.period_s, theta_std, noise, True)
+    theta = harmonics.shaft(shown)[: count * rows + 1]
     noise = math.hypot(abs(torque_per_a) * sigma_a / math.sqrt(rows), TORQUE_FLOOR * float(np.max(np.abs(mean))))
     return theta, Run(theta[::rows], mean, rows * run.period_s, theta_std, noise, False)
 
