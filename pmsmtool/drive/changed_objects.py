@@ -7,7 +7,7 @@ from pmsmtool.bus.abort_codes import BUSY_CODES
 from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.errors import SdoAbort, VerifyMismatch
+from pmsmtool.errors import DriveFault, SdoAbort, VerifyMismatch
 
 _Object = tuple[int, int]
 _MARKS: tuple[_Object, ...] = tuple(
@@ -73,10 +73,17 @@ class ChangedObjects:
         parameters = {names[key]: data for key, data in self._before.items() if key in names}
         others = {key: data for key, data in self._before.items() if key not in names}
         changed = {n: data for n, data in parameters.items() if self._drive.parameters.read([n])[n] != data}
-        lines = []
+        lines: list[str] = []
         if changed:
-            self._drive.replace(changed)
-            back |= {drive_map.address(name) for name in changed}
+            try:
+                self._drive.replace(changed)
+                back |= {drive_map.address(name) for name in changed}
+            except VerifyMismatch as mismatch:  # the limits must get their content all the same
+                lines += mismatch.differences
+            except DriveFault as fault:
+                if isinstance(fault, SdoAbort) and fault.code in BUSY_CODES:
+                    raise
+                lines += fault.what.splitlines()
         for (index, sub), data in reversed(others.items()):  # the marks, which were noted first, last
             try:
                 if self._read(index, sub) != data:

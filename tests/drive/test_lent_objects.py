@@ -24,8 +24,9 @@ from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.own_limits import LEAST_COUNTS, lower_limits, put_limit
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.process_data import LiveValues, live_values, sent_every_s
+from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.shipped_maps import load_family
-from pmsmtool.errors import BusError, NotAvailable, SafetyRefusal, SdoAbort, VerifyMismatch
+from pmsmtool.errors import BusError, DriveFault, NotAvailable, SafetyRefusal, SdoAbort, VerifyMismatch
 from tests.bus.scripted import NODE
 from tests.drive.table_drive import Held, TableDrive, node_of
 
@@ -378,6 +379,34 @@ def test_an_object_that_refuses_its_old_value_is_named_but_for_the_mode(item: Dr
         with pytest.raises(VerifyMismatch) as caught:
             changed.restore()
         assert caught.value.differences[0].startswith(named) and len(caught.value.differences) == 1
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (VerifyMismatch("the drive does not hold it", differences=["motor.R_s_ohm: wrote 1, reads 2"]), "wrote 1"),
+        (DriveFault("the drive refused 1 of 1 value"), "refused 1 of 1"),
+        (SdoAbort(0x06090030, 0x2010, 2, "node refused: value"), "node refused"),
+    ],
+)  # fmt: skip
+def test_the_limits_come_back_where_a_parameter_does_not(error: Exception, told: str) -> None:
+    """They had stayed lowered: the parameters came first, and their error ended the restore."""
+
+    def refused(changed: object) -> None:
+        raise error
+
+    with node_of({A: 5, B: 6}, reference_map()) as (table, node):
+        table.objects[0x2010, 2] = bytes(4)
+        changed = changed_of(node)
+        changed._drive.replace = refused  # type: ignore[method-assign]
+        changed.begin()
+        node.put(A, 50)
+        node.put(B, 60)
+        node.write_bytes(0x2010, 2, b"\0\0\x80\x3f")
+        with pytest.raises(VerifyMismatch, match="not everything could be restored") as caught:
+            changed.restore()
+        assert [told in line for line in caught.value.differences] == [True]
+        assert (table.number(A), table.number(B)) == (5, 6)
 
 
 @pytest.mark.parametrize(("code", "busy_s", "comes_back"), [(0x08000021, 4.5, True), (0x08000022, 9.0, False)])
