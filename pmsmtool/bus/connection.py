@@ -33,7 +33,8 @@ SEND_PATIENCE_S = 0.5
 _POLL_S = 0.05
 """The reader thread looks this often whether it shall end: half of it is what closing a bus waits."""
 _SEND_PAUSE_S = 0.001
-_RESOLUTION_S = 1e-9  # of the virtual clock; less than that never passes
+RESOLUTION_S = 1e-9
+"""Of the virtual clock: less than that never passes."""
 _SPIN_LIMIT = 200
 _SPIN_S = 0.001
 _FULL_ERRNO = (errno.ENOBUFS, errno.EAGAIN)
@@ -240,7 +241,7 @@ class Connection:
             if self.pump(max(timeout_s, 0.0)) and not frames.empty():
                 return frames.get_nowait()
             timeout_s = deadline - self.clock.now()
-            if timeout_s < _RESOLUTION_S:
+            if timeout_s < RESOLUTION_S:
                 return None
 
     def pump(self, timeout_s: float) -> bool:
@@ -277,7 +278,7 @@ class Connection:
         deadline = self.clock.now() + timeout_s
         while not condition():
             left = deadline - self.clock.now()
-            if left < _RESOLUTION_S:
+            if left < RESOLUTION_S:
                 return False
             if self._reader is None:
                 self.pump(left)

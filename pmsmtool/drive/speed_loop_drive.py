@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pmsmtool.bus.connection import Connection
+from pmsmtool.bus.connection import RESOLUTION_S, Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.motion_objects import POSITION, TORQUE_PERMILLE, allowed, current_limits, rated_current
@@ -225,7 +225,7 @@ class SpeedLoopDrive(TorqueDrive):
         end = clock.now() + seconds
         while self._recording:
             self.oscillation.check(f"node {self.node.node}")
-            while self._due and self._due[0][0] <= clock.now():
+            while self._due and self._due[0][0] - clock.now() < RESOLUTION_S:
                 speed = self._due.pop(0)[1]
                 before = clock.now()
                 self.command_speed(speed)
@@ -236,7 +236,7 @@ class SpeedLoopDrive(TorqueDrive):
             left = (min(until, clock.now() + POLL_PERIOD_S) if not self.sends else until) - clock.now()
             if left > 0.0:
                 self.node.connection.wait(left)
-            if clock.now() >= end:
+            if end - clock.now() < RESOLUTION_S:
                 break
         super().wait(max(0.0, end - clock.now()))
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,11 +17,13 @@ from pmsmtool.cia402 import Mode
 from pmsmtool.drive import motion_objects as motion
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.position_drive import FOLLOWS_S, FOLLOWS_SHARE, PositionDrive
 from pmsmtool.drive.set_point import ACKNOWLEDGE_S, POSITION_DEMAND, TARGET_POSITION, start_move
 from pmsmtool.drive.speed_loop_drive import LARGEST_COUNT, OSCILLATION_SAMPLES, Oscillation, SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.motion_objects import MotionObject
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveTimeout, LimitExceeded, NotAvailable
 from tests.bus.scripted import NODE
@@ -245,6 +248,40 @@ def test_the_current_limit_of_a_speed_loop_is_the_smallest_it_has(more: Held, bo
         assert drive.read_as_rms and drive.current_count_a == pytest.approx(1e-3 * RATED_APK)
         with pytest.raises(NotAvailable, match="takes no current"):
             drive.command_current(0.0, 0.0)
+
+
+OWN_CURRENT, OWN_RATED = DriveObject(0x3001, 1, "h"), DriveObject(0x3001, 2, "H")
+PEAK = {"current": MotionObject(0x3001, 1, "INTEGER16", "mA peak", "s")}
+RATED_PEAK = {"rated_current": MotionObject(0x3001, 2, "UNSIGNED16", "mA peak", "s")}
+RATED_OPEN = {"rated_current": MotionObject(0x3001, 2, "UNSIGNED16", "mA peak-or-rms", "s")}
+
+
+@pytest.mark.parametrize(
+    ("rows", "standard", "as_rms"),
+    [
+        ({}, True, True), (PEAK, True, False), (RATED_PEAK, False, False), (RATED_OPEN, False, True),
+        ({**PEAK, **RATED_PEAK}, False, False), (RATED_PEAK, True, True),
+    ],
+)  # fmt: skip
+def test_whether_the_current_was_taken_as_rms(rows: dict[str, MotionObject], standard: bool, as_rms: bool) -> None:
+    """A share of 0x6075 is, and one of a rated current of undecided kind; the maker's own peak amperes are not."""
+    held = {item: value for item, value in HELD.items() if standard or item is not objects.RATED_CURRENT_MA}
+    with opened({**held, OWN_CURRENT: 0, OWN_RATED: 4000}) as (_, connection):
+        assert SpeedLoopDrive(connection, NODE, drive_map=replace(GENERIC, motion=rows)).read_as_rms == as_rms
+
+
+@pytest.mark.parametrize("recording", [False, True])
+@pytest.mark.parametrize("sends", [False, True])
+def test_a_wait_lasts_as_long_as_it_is_asked_for(recording: bool, sends: bool) -> None:
+    with speed_loop() as (_, drive):
+        drive.sends = sends
+        if recording:
+            drive.begin_record(Recording((), 0, 1, None, 0), drive.wait)
+        clock = drive.node.connection.clock
+        for seconds in (0.02, 0.0, 0.05):
+            began = clock.now()
+            drive.wait(seconds)
+            assert clock.now() - began == pytest.approx(seconds, abs=1e-3)
 
 
 @pytest.mark.parametrize(("speed", "counts"), [(10.0, 20), (-10.2, -20), (10.3, 21), (0.24, 0), (-0.26, -1)])
