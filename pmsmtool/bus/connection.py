@@ -13,7 +13,7 @@ import errno
 import queue
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from types import TracebackType
 from typing import Any
@@ -92,6 +92,8 @@ class Connection:
         COB-IDs seen.
     sent : dict of int to deque
         The last requests sent per watched COB-ID, to tell our own echo from a second master.
+    sends : Counter of int
+        How many frames were sent per COB-ID.
     deaf_s : float
         How long the reader thread did not listen because the computer did not run it (s).
     listeners : list of callable
@@ -108,6 +110,7 @@ class Connection:
         self.deaf_s = 0.0
         self.heard: set[int] = set()
         self.sent: dict[int, deque[bytes]] = {}
+        self.sends: Counter[int] = Counter()
         self.listeners: list[Callable[[can.Message], None]] = []
         self.at_close: list[Callable[[], None]] = []
         self._writer = writer
@@ -166,6 +169,7 @@ class Connection:
         """
         # A fresh message each time: some adapters pad its data in place.
         message = can.Message(arbitration_id=cob_id, data=data, is_extended_id=False)
+        self.sends[cob_id] += 1
         if cob_id in self.sent:
             self.sent[cob_id].append(data)
         while True:

@@ -123,6 +123,7 @@ class SdoChannel:
         self._barriers = 0
         self._cancelled: BaseException | None = None
         self._request_id = 0x600 + node
+        self._sends = connection.sends[self._request_id]
         self._mailbox = connection.mailbox(0x580 + node)
         self._lock = threading.Lock()
 
@@ -241,6 +242,7 @@ class SdoChannel:
     def send(self, frame: bytes) -> None:
         """Send one request of eight bytes."""
         self.connection.send(self._request_id, frame)
+        self._sends = self.connection.sends[self._request_id]
 
     def receive(self, timeout_s: float) -> bytes | None:
         """Return the next frame of the node, or None after ``timeout_s`` on the bus clock."""
@@ -479,6 +481,8 @@ class SdoChannel:
                 hint="let the callback only take notes; this is a bug worth reporting",
             )
         with self._lock:
+            if self.connection.sends[self._request_id] != self._sends:  # another channel to this node has asked, too
+                self._answers.clear()
             for frame in self._mailbox.clear():
                 attempt.discarded += 1
                 self._compare(frame.ljust(8, b"\0"))

@@ -156,3 +156,12 @@ def test_an_examination_tells_two_nodes_on_one_id(slave: Altered, second: str) -
             len(told) == 1
             and f"node {NODE}: two nodes answer on this id, an answer for 0x1000:00 came twice" in told[0]
         )
+
+
+def test_two_channels_of_this_program_are_no_two_nodes(node: DriveNode) -> None:
+    """What one of them writes is answered in the mailbox of the other, which has read the same object before."""
+    other = SdoChannel(node.connection, NODE)
+    assert node.sdo.read(*NUMBER) == b"\1\2\3\4"
+    other.download(*NUMBER, b"\1\2\3\5")
+    assert node.sdo.read(*NUMBER) == b"\1\2\3\5" and not node.sdo.contradiction and not other.contradiction
+    assert node.identity().vendor == 1
