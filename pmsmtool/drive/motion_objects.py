@@ -45,8 +45,10 @@ RATED_RMS = 1e-3 * math.sqrt(2.0)
 LEAST_UNITS = 24
 """Fewest units of position per turn: one within the 50 ms between two looks at the speed is 5 rad/s then. Files of
 makers say 1 where nothing was set up."""
-NO_RATED = "its rated current (0x6075, or the maker's own object in a map that names this drive)"
-NO_COUNTS = "how many increments its encoder has per turn (0x608F, or the maker's own object in a map)"
+NO_RATED = (
+    "its rated current (0x6075, or in a map that names this drive: the maker's object, or the name plate's number)"
+)
+NO_COUNTS = "how many increments its encoder has per turn (0x608F, or in a map: the maker's object, or a number)"
 OVER_SPEED_TRIP, TRIP_RATIO = "protection.n_trip_rpm", 1.5
 """Speed at which a drive that has such a trip removes the voltage by itself, whatever commands it, over the envelope's:
 above what the tool's own look sees first, so that the limit is named."""

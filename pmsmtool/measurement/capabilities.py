@@ -65,7 +65,8 @@ FEATURES: Mapping[str, str] = {
     "recorder": "a recorder of currents and voltages that this program reads",
     "torque mode": "torque mode (0x6502 bit 3 or 9)",
     "push": "torque mode (0x6502 bit 3 or 9), or a velocity mode whose unit a map states, with a current limit",
-    "position": "position in increments of a known number per turn (0x6064 with 0x608F, or in a map of its maker)",
+    "position": "position in increments of a known number per turn (0x6064 with 0x608F, or in a map: an object, or a "
+    "number)",
     "encoder": "an encoder: between two edges of Hall sensors (hall.commutation) the angle is not measured",
     "frame": "a frame that turns with the rotor: not six steps (hall.commutation 3; 2 for this time)",
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
