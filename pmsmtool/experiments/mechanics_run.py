@@ -132,7 +132,9 @@ def _coast(drive: Drive, plan: MechanicsPlan) -> Trace:
 def _parts(whole: Trace, i_q_a: float, push_s: float) -> tuple[Trace, Trace]:
     """Return push and coasting of a record that has both."""
     flows = np.nonzero(np.abs(whole["i_q_a"]) > CURRENT_OFF * abs(i_q_a))[0]
-    ends = int(push_s / whole.period_s), min(int(flows[-1]) + 1, len(whole) - 2)
+    pushed = int(push_s / whole.period_s)
+    # a current may stay away, or not go
+    ends = pushed, min(max([pushed, *(flows[-1:] + 1)]), len(whole) - 2)
     push, coasting = (
         replace(whole, t_s=whole.t_s[part] - whole.t_s[part][0], signals={n: whole[n][part] for n in whole.signals})
         for part in (slice(0, ends[0]), slice(ends[1], None))

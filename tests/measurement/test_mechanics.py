@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -17,6 +18,8 @@ from pmsmtool.cli.main import cli
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
 from pmsmtool.estimators.estimate import statistical_half_width, total_half_width
+from pmsmtool.estimators.shaft.mechanics import POWERED
+from pmsmtool.experiments.mechanics_run import _parts
 from pmsmtool.identification.evaluate import evaluate
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
@@ -102,3 +105,14 @@ def test_a_shaft_that_friction_stops_while_its_push_is_read_out_coasts_within_th
     found = {value["name"]: value for value in json.loads(outcome.stdout)["values"]}
     for name, true in (("J_kgm2", 0.03), ("tau_c_nm", FRICTION_NM)):
         assert abs(found[name]["value"] - true) < found[name]["total_95"] < WITHIN[name] * true, name
+
+
+@pytest.mark.parametrize(("current", "begins"), [([4.0] * 60 + [1.0, 0.3] + [0.0] * 138, 62), ([0.0] * 200, 60),
+                                                 ([4.0] * 200, 198), ([4.0] * 30 + [0.0] * 170, 60)])  # fmt: skip
+def test_a_record_of_push_and_coasting_is_cut_where_the_current_has_gone(current: list[float], begins: int) -> None:
+    """A current that never came ended in exit 70."""
+    t, theta = 1e-3 * np.arange(200), np.linspace(0.0, 1.0, 200)
+    signals = {"theta_M_rad": theta, "i_d_a": np.zeros(200), "i_q_a": np.array(current), "flagged": np.zeros(200)}
+    push, coasting = _parts(Trace(t, signals, dict.fromkeys(signals, "1"), {"coasting": False}), 4.0, 0.0605)
+    assert len(push) == 60 and not push.meta["coasting"] and coasting.meta["coasting"] and coasting.meta[POWERED]
+    assert coasting.t_s[0] == 0.0 and coasting["theta_M_rad"][0] == theta[begins] and len(coasting) == 200 - begins
