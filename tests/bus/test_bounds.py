@@ -241,7 +241,6 @@ def test_a_store_under_way_is_waited_for_and_no_longer(code: int | None) -> None
     bus = ScriptedBus(slave)
     bus.clock.after(1.5, lambda: setattr(slave, "hung", False))
     node = DriveNode(Connection(bus), NODE)
-    node.sdo.slow_objects.clear()
     node.wait_for_store()
     assert 1.5 < bus.clock.now() < 3.0
 
