@@ -11,6 +11,7 @@
 #include <stddef.h>
 
 #define TRACE_STEP 0.04   /* of I_max, along the voltage limit */
+#define CLOSED_STEP 0.5   /* of the way from the centre: no step along a flat side passes two extremes of the torque */
 #define TRACE_STEPS 2000
 #define FULL_TURN 6.2831853071795865
 #define ON_BORDER 1e-12   /* of I_max: a point on the domain's border */
@@ -45,7 +46,8 @@ static void consider(search *run, const pmsm_point *at)
  * the torque on the way is a candidate (a machine with strong saliency has more than one of a kind). */
 static void follow(search *run, const pmsm_point *start, const pmsm_point *centre)
 {
-    const double length = TRACE_STEP * run->plane->I_max;
+    const double across = centre ? hypot(start->d - centre->d, start->q - centre->q) : (double)INFINITY;
+    const double length = fmin(TRACE_STEP * run->plane->I_max, CLOSED_STEP * across);
     pmsm_point from = *start, to, top;
     double turned = 0.0;
     for (int32_t k = 0; k < TRACE_STEPS && fabs(turned) < FULL_TURN; k++) {
