@@ -199,6 +199,7 @@ def looked(drive: Shown, guard: GuardedDrive) -> str:
     ("shown", "envelope", "ends"),
     [
         ({"i_d_a": 3.0, "i_q_a": -3.99}, {}, False), ({"i_d_a": 3.0, "i_q_a": -4.01}, {}, True),
+        ({"i_d_a": 3.0, "i_q_a": -4.0}, {}, False),
         ({"omega_e_rad_s": -374.0}, {}, False), ({"omega_e_rad_s": -376.0}, {}, True),
         ({"omega_e_rad_s": math.nan}, {}, True),
         ({"theta_m_rad": 1.49}, {"travel_rad": 0.5}, False), ({"theta_m_rad": 0.49}, {"travel_rad": 0.5}, True),

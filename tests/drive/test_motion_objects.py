@@ -277,11 +277,11 @@ def test_the_drives_own_trip_is_lowered_with_the_envelope(
         ({}, ["current", "speed"]), ({objects.MAX_CURRENT_PERMILLE: 1}, ["speed"]),
         ({objects.MAX_SPEED_RPM: 1}, ["current"]),
         ({motion.MAX_TORQUE_PERMILLE: 1, objects.MAX_SPEED_RPM: 1}, []),
-        ({motion.MAX_TORQUE_PERMILLE: 1, objects.MAX_SPEED_RPM: 1, **SLOW}, ["slope 10 s: torque pulses are slow"]),
+        ({motion.MAX_TORQUE_PERMILLE: 1, objects.MAX_SPEED_RPM: 1, **SLOW}, ["slope 10 s: raised for the pulses"]),
         ({motion.MAX_TORQUE_PERMILLE: 1, objects.MAX_SPEED_RPM: 1, **SLOW, objects.SUPPORTED_MODES: 0x200},
          ["slope 10 s: mode 10 ignores it"]),
         ({motion.MAX_TORQUE_PERMILLE: 1, objects.MAX_SPEED_RPM: 1, **SLOW, objects.SUPPORTED_MODES: 0x500},
-         ["slope 10 s: torque pulses are slow"]),
+         ["slope 10 s: raised for the pulses"]),
     ],
 )  # fmt: skip
 def test_what_the_drive_does_not_keep_by_itself_is_told(held: Held, told: list[str]) -> None:

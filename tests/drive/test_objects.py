@@ -98,7 +98,7 @@ def test_index_sub_and_type(dictionary: canopen.ObjectDictionary, name: str) -> 
     item = all_objects()[name]
     variable = dictionary.get_variable(item.index, item.sub)
     assert isinstance(variable, ODVariable), f"{name} is not in the EDS"
-    assert LETTERS[variable.data_type or 0] == item.letter
+    assert LETTERS[variable.data_type or 0] == item.letter and variable.subindex == item.sub
     group, _, number = name.rstrip("]").partition("[")
     meant = NUMBERED[group].format(int(number) + 1) if number else MEANT[name]
     assert variable.name.startswith(meant), "another object of the same type"

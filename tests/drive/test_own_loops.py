@@ -19,7 +19,7 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
-from pmsmtool.drive.position_drive import FOLLOWS_S, FOLLOWS_SHARE, PositionDrive
+from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.drive.set_point import ACKNOWLEDGE_S, POSITION_DEMAND, TARGET_POSITION, start_move
 from pmsmtool.drive.speed_loop_drive import LARGEST_COUNT, OSCILLATION_SAMPLES, Oscillation, SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
@@ -163,8 +163,8 @@ LIMIT_RAD = 2.0
 @pytest.mark.parametrize(
     ("lag", "nearer", "ended"),
     [
-        (0.99, 0.0, False), (1.0, 0.0, False), (1.01, 0.0, True), (1.01, 2.0 * FOLLOWS_SHARE, False),
-        (1.01, 0.5 * FOLLOWS_SHARE, True),
+        (0.99, 0.0, False), (1.0, 0.0, False), (1.01, 0.0, True), (1.01, 0.011, False),
+        (1.01, 0.009, True),
         (1.01, -0.5, True), (2.19, 0.5, False), (2.21, 0.5, True), (0.5, -0.5, False),
     ],
 )  # fmt: skip
@@ -183,8 +183,8 @@ def test_a_move_ends_where_the_shaft_lags_and_does_not_follow(
     demand = 8.0 * way
     at, nearer = demand - way * lag * LIMIT_RAD, nearer * LIMIT_RAD
     drive._taken = [
-        (0.0, at - way * 99.0, demand, 0.0), (1.0 - FOLLOWS_S, at - way * nearer, demand, 0.0),
-        (1.0 - 0.5 * FOLLOWS_S, at + way * 99.0, demand + 50.0, 0.0), (1.0, at, demand, 0.0),
+        (0.0, at - way * 99.0, demand, 0.0), (0.95, at - way * nearer, demand, 0.0),
+        (0.97, at + way * 99.0, demand + 50.0, 0.0), (1.0, at, demand, 0.0),
     ]  # fmt: skip
     if ended:
         with pytest.raises(LimitExceeded, match="following error") as caught:
