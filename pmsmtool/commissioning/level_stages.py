@@ -51,8 +51,6 @@ NOT_SHOWN = (
     "; the guarantee of its limits bounds a voltage that it does not record (on a simulated node: `pmsmtool reproduce "
     "closed-drive`)"
 )
-BY_ANGLE = ("poles", "encoder")
-"""What a drive without injection tells by a vector that its mode 11 turns."""
 FOR_READING = "the drive has no object for the table"
 
 
@@ -158,19 +156,8 @@ class LevelStages:
             reason = "needs a rotor that may turn, and the shaft is locked"
         if not reason:
             method = OF_LEVEL[found.level]
-
-            def measured(wanted: IdentifyRequest) -> Stage:
-                return _stopped(identify(run, drive, wanted, allow, say, method=method, found=found, known=known), True)
-
             try:
-                try:
-                    return measured(asked)
-                except NotAvailable as error:  # mode 11, announced in 0x6502 and refused
-                    others = tuple(name for name in asked.quantities if name not in BY_ANGLE)
-                    if others == asked.quantities or known is None:
-                        raise
-                    say(f"{', '.join(BY_ANGLE)}: not measured: {error.what}")
-                    return measured(replace(asked, quantities=others))
+                return _stopped(identify(run, drive, asked, allow, say, method=method, found=found, known=known), True)
             except IdentificationError as error:
                 if error.reason != TOO_WIDE or self.nameplate is None:
                     raise

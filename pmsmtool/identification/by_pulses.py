@@ -51,6 +51,8 @@ SUPPLY_LEVELS = "supply_levels"
 """Name of the trace of a bench supply's readings."""
 NO_VOLTAGE = "needs injection, or a recorder of voltages at loop rate"
 NO_POLE_PAIRS = "needs the pole pairs: mode 11, an object in the drive's map, or a machine file"
+BY_ANGLE = ("poles", "encoder")
+"""What a drive without injection tells by a vector that its mode 11 turns."""
 NO_LINK = "needs the DC link (0x6079) or the machine's voltage"
 TOO_WIDE = "E_NOT_IDENTIFIABLE"
 """Refusal of ratios whose interval is too wide: the flux linkage beside them stands, and the chain goes on."""
@@ -332,13 +334,16 @@ def evaluated_stage(
             traces, facts, tolerance, known.inverter, machine.psi_f_wb, copper_of(known),
             machine.alpha_psi_per_k,
         )  # fmt: skip
-    if {"psi", "mechanics"} & set(request.quantities) and facts.kind == Method.STANDARD and not facts.pushed:
+    asked = request.quantities
+    if facts.no_vector and known is not None:  # as given, like everything that is not measured
+        asked = tuple(name for name in asked if name not in BY_ANGLE)
+    if {"psi", "mechanics"} & set(asked) and facts.kind == Method.STANDARD and not facts.pushed:
         result = replace(result, missing={**result.missing, "J_per_psi, psi_f_wb": NO_POLE_PAIRS})
-    if not any(set(TOLD_BY.get(name, ())) & set(result.estimates) for name in request.quantities):
+    if not any(set(TOLD_BY.get(name, ())) & set(result.estimates) for name in asked):
         reasons = [f"{name}: not available: {why}" for name, why in result.missing.items()]
         raise NotAvailable("\n  - ".join(["nothing that was asked for was identified", *reasons]), where=str(run.path))
     designed = completed_machine(known, result.estimates, facts.source).machine
-    judgement = judged(result.estimates, result.missing, request.quantities, designed)
+    judgement = judged(result.estimates, result.missing, asked, designed)
     made = completed_machine(known, judgement.kept(result.estimates), facts.source)
     files = dict.fromkeys((*(f"traces/{name}.npz" for name in traces), REQUEST, facts_name(run) or FACTS), "")
     if made.machine is not None and judgement.verdicts.accepted:
@@ -353,8 +358,8 @@ def evaluated_stage(
         status = "partial" if stage.status == "pass" else stage.status
         said = f"{stage.summary}; {SIGN}: {wrong[SIGN]}"
         stage = replace(stage, status=status, summary=said, refused={**stage.refused, **wrong})
-    fallbacks = [*stage.fallbacks, facts.limit] if facts.limit else stage.fallbacks
-    return replace(stage, files=files, fallbacks=fallbacks)
+    no_vector = f"{', '.join(BY_ANGLE)}: not measured: {facts.no_vector}" if facts.no_vector else ""
+    return replace(stage, files=files, fallbacks=[*stage.fallbacks, *filter(None, (facts.limit, no_vector))])
 
 
 def dump_facts(facts: PulseFacts) -> str:

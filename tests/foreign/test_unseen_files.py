@@ -257,3 +257,14 @@ def test_a_slow_slope_of_a_healthy_drive_is_no_wiring(tool: Tool) -> None:
     """200 permille per second, mode 4 alone: 'check' named an open phase, and 'identify' ended after 600 s."""
     code, verdicts, said = checked(tool, unknown("0x2D", (0x6087, 0, "U32", "rw", "200")))
     assert code == 10 and verdicts["shaft"] == "ok", said
+
+
+@pytest.mark.chain
+def test_a_refused_mode_stands_in_no_chains_way(tool: Tool) -> None:
+    """The machine file states the pole pairs: the chain goes on as on a drive that does not announce mode 11."""
+    write_eds(Path("x.eds"), unknown("0x42D", (0x60EA, 0, "U16", "rw", "0")), NO_MODE_11)
+    profile = str(machine_path("interior-2k2"))
+    code, out, said = tool("--yes", "commission", profile, "--eds", "x.eds", "--json")
+    assert code == 10 and "E_NOT_ACCEPTED" not in said + out, said
+    (record,) = Path("runs").glob("*/run.json")
+    assert "(11), which 0x6502 announces" in record.read_text(encoding="utf-8")
