@@ -251,8 +251,8 @@ def test_fits_arrive_where_the_encoder_alone_makes_a_narrow_valley() -> None:
         assert abs(value.value - true) < 4.0 * value.std
 
 
-def with_drag(traces: list[Trace], drag: float) -> list[Trace]:
-    """The same run of a shaft that the air brakes, too: integrated in small steps, with the encoder's step."""
+def with_drag(traces: list[Trace], drag: float = 0.0, stribeck: float = 0.0, omega_s: float = 1.0) -> list[Trace]:
+    """The same run of a shaft that the air brakes, or that Stribeck's friction holds: integrated in small steps."""
     omega, out, step = 0.0, [], 2.0 * math.pi / 2**BITS
     for trace in traces:
         period, fine = trace.period_s, 8
@@ -261,7 +261,8 @@ def with_drag(traces: list[Trace], drag: float) -> list[Trace]:
             for _ in range(fine):
                 h = period / fine
                 sign = math.copysign(1.0, omega if omega != 0.0 else torque)
-                rate = (torque - B * omega - TAU_C * sign - drag * omega * abs(omega)) / J
+                held = TAU_C * (1.0 + stribeck * math.exp(-((omega / omega_s) ** 2)))
+                rate = (torque - B * omega - held * sign - drag * omega * abs(omega)) / J
                 theta += h * omega + 0.5 * h * h * rate
                 omega += h * rate
             shown.append(theta)
@@ -280,6 +281,19 @@ def test_drag_over_the_square_of_the_speed_is_told_from_friction() -> None:
     for value, true in ((found.J, J), (found.B, B), (found.tau_c, TAU_C)):
         assert abs(value.value - true) < 3.0 * value.std + 1e-3 * true
     assert "square of the speed" in found.note and estimate(traces).drag is None
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("stribeck", [0.3, 0.6])
+def test_friction_that_falls_with_the_speed_is_no_drag(stribeck: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, a drag of 15 standard deviations: at ten times this speed 30 times the friction."""
+    monkeypatch.setattr(f"{__name__}.B", 0.0)
+    monkeypatch.setattr(f"{__name__}.TAU_C", 3.0 * TAU_C)
+    traces = run_of(np.random.default_rng(5))
+    fastest = max(float(np.max(np.abs(np.diff(t["theta_M_rad"])))) / t.period_s for t in traces)
+    found = estimate(with_drag(traces, stribeck=stribeck, omega_s=0.1 * fastest))
+    assert found.drag is None and found.J.value == pytest.approx(J, rel=1e-3), "within 2e-4 seen"
+    assert abs(found.B.value) < 2.0 * found.B.std, "between the models with drag and without lies none"
 
 
 def braked(rng: np.random.Generator, tilt: float = 0.0, friction: float = 0.0, encoder: float = 0.0) -> list[Trace]:
