@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.estimators.flux.voltage_flux import STEADY
+from pmsmtool.estimators.flux.voltage_flux import RISING, STEADY, current_rise
 from pmsmtool.experiments.shaft_answer import OVER_FRICTION, ShaftAnswer, acceleration_per_ampere, brake_shaft
 from pmsmtool.experiments.signals import readable
 from pmsmtool.trace import Trace
@@ -159,7 +159,7 @@ def coast_both_ways(
 
 
 def _steady_top(drive: Drive, command_a: float, top_rad_s: float) -> Trace | None:
-    """Record until the speed is steady, or :data:`HOLDS` times; None where it goes beyond the top speed.
+    """Record until speed and current are steady, or :data:`HOLDS` times; None where it goes beyond the top speed.
 
     A small current brings a shaft with friction from where the larger one stalled to the top slowly.
     """
@@ -171,7 +171,7 @@ def _steady_top(drive: Drive, command_a: float, top_rad_s: float) -> Trace | Non
         first, second = (abs(angle[k + half - 1] - angle[k]) / (t[k + half - 1] - t[k]) for k in (0, len(t) - half))
         if second > top_rad_s:
             return None
-        if abs(second - first) <= 0.5 * STEADY * second:
+        if abs(second - first) <= 0.5 * STEADY * second and abs(current_rise(found)) <= RISING:
             break
     return found
 

@@ -96,6 +96,10 @@ def test_the_voltage_limit_gives_the_flux_linkage_with_the_dead_time_taken_off()
         flux_by_voltage_limit(top(speed, 0.95), pole_pairs=POLE_PAIRS, utilisation=utilisation)
     with pytest.raises(IdentificationError, match="E_NOT_SETTLED"):
         flux_by_voltage_limit(top(speed, 0.3, drift=0.5), pole_pairs=POLE_PAIRS, utilisation=utilisation)
+    back = top(speed, 0.3)
+    back.signals["i_q_a"][:] *= np.linspace(0.6, 1.4, len(back))  # 0.12 of the current more in the second half
+    with pytest.raises(IdentificationError, match="E_NOT_SETTLED.*current"):
+        flux_by_voltage_limit(back, pole_pairs=POLE_PAIRS, utilisation=utilisation)
 
 
 def coast(rng: np.random.Generator, w_M: float) -> Trace:

@@ -35,6 +35,9 @@ HELD_SHARE = 0.85
 """Current, of the one asked for, above which it is not the voltage that holds the speed: there all of it flows."""
 STEADY = 0.02
 """Largest relative change of the speed over the record of the top."""
+RISING = 0.1
+"""Largest change of the current over it, of the one asked for: where it comes back, the voltage has not ended. A loop
+that left its limit slowly made the psi of a salient motor 18 % too large, at +-3.6 %."""
 
 
 def flux_by_undriven_voltage(
@@ -111,6 +114,8 @@ def flux_by_voltage_limit(
     w_M = 0.5 * (first + second)
     if not w_M > 0.0 or abs(second - first) > STEADY * w_M:
         raise refuse("E_NOT_SETTLED", "the speed at the voltage limit is not steady", stage="voltage limit")
+    if abs(current_rise(top)) > RISING:
+        raise refuse("E_NOT_SETTLED", "the current at the voltage limit is not steady", stage="voltage limit")
     flowing = abs(float(top["i_q_a"].mean()) / float(top.meta["i_command_a"]))
     if flowing > HELD_SHARE:
         raise refuse(
@@ -124,3 +129,9 @@ def flux_by_voltage_limit(
     return Estimate(
         psi, psi * abs(second - first) / w_M, doubt * psi, "Wb", n=len(top), method="speed at the voltage limit"
     )
+
+
+def current_rise(top: Trace) -> float:
+    """Return how much more current flows in the second half of a record than in the first, of the one asked for."""
+    half = len(top) // 2
+    return float(top["i_q_a"][half:].mean() - top["i_q_a"][:half].mean()) / float(top.meta["i_command_a"])
