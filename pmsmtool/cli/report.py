@@ -31,7 +31,6 @@ news.addEventListener("end", () => news.close());</script>"""
     epilog=examples(
         "pmsmtool report runs/20260101T120000Z-000055f1",
         "pmsmtool report --follow runs",
-        "pmsmtool report --pdf runs/20260101T120000Z-000055f1",
         "pmsmtool report --junit runs/20260101T120000Z-000055f1 -o result.xml",
         "pmsmtool report --anonymous runs/20260101T120000Z-000055f1 -o to-send.json",
     ),
