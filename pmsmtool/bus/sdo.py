@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import math
 import threading
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from pmsmtool.bus import sdo_block, sdo_segmented
 from pmsmtool.bus.abort_codes import TRANSPORT_CODES, AbortCode, abort_advice, abort_text
 from pmsmtool.bus.connection import Connection
+from pmsmtool.bus.given_answers import GivenAnswers, named
 from pmsmtool.bus.sdo_transfer import (
     LARGEST_UNKNOWN,
     MULTIPLEXOR,
@@ -55,12 +55,6 @@ BARRIER = ((0x1000, 0), (0x1018, 1), (0x1018, 2), (0x1018, 0))
 """Objects every node answers for, read in turn: what arrives before the answer belongs to the past."""
 SLOWEST_ANSWER_S = 1.0
 """The time-out grows to this with a node that answers late."""
-NAMING = (2, 3, 4)
-"""Server command specifiers of the answers that name their object: upload, download, abort."""
-REMEMBERED = 4
-"""Answers kept to compare late ones with: a second node may be slower by a few round trips."""
-LATEST_S = 2.0
-"""After a lost answer, what comes within this time may be that one."""
 WRONG_ANSWERS = "the drive's SDO server answers wrongly, or two nodes share this node id"
 GIVEN_UP = "the node is busy, or frames get lost on the bus"
 """Causes of a transfer that timed out although the node sends."""
@@ -90,8 +84,6 @@ class SdoChannel:
         None until a block transfer was tried.
     retries, discarded : int
         Sums over the life of the channel.
-    contradiction : str
-        The last answer that came a second time and said something else: two nodes answer. Empty where none did.
     active_s : float
         When (s, bus clock) the caller's thread last was at work in a transfer.
     """
@@ -111,9 +103,7 @@ class SdoChannel:
         self.block_supported: bool | None = None
         self.retries = 0
         self.discarded = 0
-        self.contradiction = ""
-        self._answers: deque[bytes] = deque(maxlen=REMEMBERED)
-        self._compared_from_s = -math.inf
+        self._answers = GivenAnswers()
         self._check = check
         self.active_s = -math.inf
         self._over_s = math.inf
@@ -239,6 +229,11 @@ class SdoChannel:
 
     # ---- for the transfer modules ---------------------------------------------------------------
 
+    @property
+    def contradiction(self) -> str:
+        """The last answer that came a second time and said something else: two nodes answer. Empty where none did."""
+        return self._answers.contradiction
+
     def send(self, frame: bytes) -> None:
         """Send one request of eight bytes."""
         self.connection.send(self._request_id, frame)
@@ -269,22 +264,22 @@ class SdoChannel:
                 self.raise_if_abort_of(attempt, frame)
             elif frame is not None and accept(frame):
                 self._unanswered_s = None
-                self._remember(frame)
+                self._answers.keep(frame, self.connection.clock.now())
                 return frame
             now = self.connection.clock.now()
             if frame is None or now > deadline:  # whoever floods the channel does not prolong the wait
                 silence = f"no answer to {what} within {attempt.timeout_s:.2g} s"
                 raise TransferLost(f"{silence}{instead}", likely=WRONG_ANSWERS if instead else "")
             attempt.discarded += 1
-            self._compare(frame)
-            instead = f", but {_named(frame)}"
+            self._answers.compare(frame)
+            instead = f", but {named(frame)}"
 
     def raise_if_abort_of(self, attempt: Attempt, frame: bytes) -> None:
         """Raise when an abort frame belongs to this transfer; a node that names no object means us."""
         if not attempt.owns(frame) and MULTIPLEXOR.unpack_from(frame)[1:] != (0, 0):
             return
         self._unanswered_s = None
-        self._remember(frame)
+        self._answers.keep(frame, self.connection.clock.now())
         code = int.from_bytes(frame[4:8], "little")
         if code in TRANSPORT_CODES:
             raise TransferLost(
@@ -295,21 +290,6 @@ class SdoChannel:
             code, attempt.index, attempt.sub, f"node refused: {abort_text(code)} ({code:#010x})",
             where=self._where(attempt), likely=likely, hint=hint,
         )  # fmt: skip
-
-    def _remember(self, answer: bytes) -> None:
-        if self.connection.clock.now() > self._compared_from_s:
-            self._answers.append(answer)
-
-    def _forget_answers(self) -> None:
-        """After a lost answer: what still comes for a while may be late, and contradicts nothing."""
-        self._answers.clear()
-        self._compared_from_s = self.connection.clock.now() + LATEST_S
-
-    def _compare(self, frame: bytes) -> None:
-        """Note an answer to a request that was answered before, and otherwise."""
-        alike = [answer for answer in self._answers if answer[1:4] == frame[1:4]]
-        if frame[0] >> 5 in NAMING and alike and frame not in alike and not _is_of_transport(frame):
-            self.contradiction = f"{_named(frame)} came twice, as {alike[-1].hex(' ')} and as {frame.hex(' ')}"
 
     def check_announced(self, attempt: Attempt, announced: int | None) -> None:
         """Compare the announced with the expected length before anything is transferred."""
@@ -357,7 +337,7 @@ class SdoChannel:
                 return once(), count
             except TransferLost as lost:
                 self._unsettled = True
-                self._forget_answers()
+                self._answers.forget(self.connection.clock.now())
                 attempt.notes.append(f"try {count}: {lost.what}")
                 self._leave(attempt, lost)
                 if recover is not None and attempt.mode is Mode.EXPEDITED and recover():
@@ -485,20 +465,20 @@ class SdoChannel:
                 self._answers.clear()
             for frame in self._mailbox.clear():
                 attempt.discarded += 1
-                self._compare(frame.ljust(8, b"\0"))
+                self._answers.compare(frame.ljust(8, b"\0"))
             self.raise_if_pointless()
             try:
                 yield attempt
             except OutOfTime:
                 self._unsettled = True
-                self._forget_answers()
+                self._answers.forget(self.connection.clock.now())
                 self._abort_quietly(attempt)
                 raise
             except (SdoAbort, DriveTimeout):
                 raise
             except BaseException:
                 self._unsettled = True
-                self._forget_answers()
+                self._answers.forget(self.connection.clock.now())
                 # Interrupted, cancelled or supervised away: the node must not stay inside a transfer.
                 self._abort_quietly(attempt)
                 raise
@@ -529,7 +509,7 @@ class SdoChannel:
     def _result(self, attempt: Attempt, data: bytes, tries: int) -> Transfer:
         self.retries += tries - 1
         if tries > 1:  # the answer to an earlier try may still come
-            self._forget_answers()
+            self._answers.forget(self.connection.clock.now())
         return Transfer(data, attempt.mode, tries, attempt.retransmitted, attempt.discarded, tuple(attempt.notes))
 
     def _where(self, attempt: Attempt) -> str:
@@ -548,18 +528,6 @@ class SdoChannel:
             return DriveTimeout(what, where=where, likely=likely, hint=hint)
         likely, hint = abort_advice(lost.code)
         return SdoAbort(lost.code, attempt.index, attempt.sub, what, where=where, likely=likely, hint=hint)
-
-
-def _named(frame: bytes) -> str:
-    """Say what a frame is that was not the answer awaited."""
-    if frame[0] >> 5 not in NAMING:
-        return "a segment with the wrong toggle bit, or a late one"
-    _, index, sub = MULTIPLEXOR.unpack_from(frame)
-    return f"an answer for 0x{index:04X}:{sub:02X}"
-
-
-def _is_of_transport(frame: bytes) -> bool:
-    return frame[0] == 0x80 and int.from_bytes(frame[4:8], "little") in TRANSPORT_CODES
 
 
 def _expedited(index: int, sub: int, data: bytes) -> bytes:
