@@ -20,66 +20,31 @@ from numpy.typing import NDArray
 from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.prediction import Direction, Prediction, Runs, predict
-from pmsmtool.design.tolerance import Samples, tolerance_box
+from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.drive.port import Excitation, Injection
 from pmsmtool.estimators.resistance import at_the_test
-from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.flux_map import FluxScale, ScalableMap
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.machine.torque import iron_drag
-from pmsmtool.machine.two_masses import ZETA_FACTOR, doubt
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.proof.defects import DEFECTS, QUANTITIES, Defect, is_possible
+from pmsmtool.proof.drawn_machine import EMF_HARMONICS, T_MAGNET_SPREAD_K, T_SPREAD_K, U_DC_SPREAD, about, draw_machine
 from pmsmtool.proof.plan import Conditions, Experiment, ProofPlan
 from pmsmtool.proof.simulated_move import hold, record_move
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
-from pmsmtool.sim.kernel import Params, Part, Setup, Simulation, library
+from pmsmtool.sim.kernel import Params, Part, Setup, Simulation
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.signals import Truth
-from pmsmtool.sim.simulated_machine import MODELS, SHAPES, build_setup
-from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
+from pmsmtool.sim.simulated_machine import build_setup
+from pmsmtool.units import rpm_from_rad_s
 
 RUNS = 96
 """Drawn machines: the largest of 96 holds 95 % of all with a confidence of 99.3 %."""
 FAULT_RUNS = 4
 """Drawn machines behind each fault's signature, for :data:`RUNS`; the first of the healthy ones, with their numbers."""
 
-T_SPREAD_K = 5.0
-"""Half range of the winding's temperature about its sensor, and of the magnets' about theirs."""
-T_MAGNET_SPREAD_K = 15.0
-"""Half range of the magnets' temperature about the winding's where they have no sensor."""
-U_DC_SPREAD = 0.01
 RIPPLE_LEAST = 0.005
 """Amplitude of the link's ripple, relative, from which on it is drawn: what less does, :data:`U_DC_SPREAD` covers."""
-RIPPLE_HZ = (100.0, 120.0, 300.0, 360.0)
-"""Its frequency: twice that of the mains behind one phase, six times behind three."""
-DEAD_SPREAD = 0.2
-KNEE_FACTOR = 3.0
-MISMATCH_OF_LEGS = 0.05
-LARGEST_DROP_SHARE = 0.5
-"""Inverter: half range of its plateau, factor either way of its knee, dead times of the legs against each other, and
-largest part of the plateau that comes from thresholds."""
-FRICTION_SHARE = 0.03
-"""Largest Coulomb and viscous friction, of the rated torque, where the machine file gives none."""
-FRICTION_FACTOR = 2.0
-"""Factor either way where it gives them."""
-LAG_SHARES, LAG_S = (0.1, 0.4), 20e-6
-"""Largest lag of the current sensors where it was not identified: that of amplifier and filter (s), within these shares
-of the control period. With a tenth of it a healthy drive (17 of 44 us) was 1.23 half widths of the delay off."""
-TIMING_COVERAGE = 2.0
-"""Half range of identified lag and instant, of their standard deviation."""
-OFFSET_SHARE = 0.001
-MISMATCH = 0.002
-"""Standard deviations of sensor offsets (of I_max) and of the phases' gains against each other."""
-SEEN_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
-"""Range of identified eddy currents, drag, cogging, encoder errors and ripple of the link, and factor either way of the
-currents' time constant: one branch stands for many, one order for the orders of the cogging."""
-EMF_HARMONICS = {"psi_5_wb": ("psi_6", 5, 0.05), "psi_7_wb": ("psi_7", 7, 0.03)}
-"""Harmonics of the back-EMF: in a machine file's estimates, in the plant, of a phase, and the largest of the usual
-range, of the fundamental, where none was identified (a healthy machine with 3.7 % of the 5th was at 1.29 of the band of
-a speed step without). Patterns that are repeated are then simulated without: their bands have the ripple that the
-repeats show, and with 5 % in them a gain 20 % too high passed on one drive."""
 BASE_SPEED = (-0.03, 0.01)
 """Relative range of the speed that is held before current steps: what coasting lets it lose, too."""
 COAST_PERIODS = 64
@@ -172,11 +137,11 @@ class SimulatedDrives:
         rng = np.random.default_rng([seed, 1])
         samples = tolerance_box(
             as_tested(machine),
-            U_dc_v=_about(conditions.U_dc_v, U_DC_SPREAD * conditions.U_dc_v),
-            T_winding_c=_about(base.T_winding, T_SPREAD_K),
-            T_magnet_c=_about(base.T_magnet, T_MAGNET_SPREAD_K if math.isnan(conditions.T_magnet_c) else T_SPREAD_K),
+            U_dc_v=about(conditions.U_dc_v, U_DC_SPREAD * conditions.U_dc_v),
+            T_winding_c=about(base.T_winding, T_SPREAD_K),
+            T_magnet_c=about(base.T_magnet, T_MAGNET_SPREAD_K if math.isnan(conditions.T_magnet_c) else T_SPREAD_K),
         ).draw(runs, seed, 0)
-        return [_draw(base, machine, samples, row, rng, self._design["motor.I_max_apk"]) for row in range(runs)]
+        return [draw_machine(base, machine, samples, row, rng, self._design["motor.I_max_apk"]) for row in range(runs)]
 
     def respond(self, experiment: Experiment, defect: Defect | None = None, runs: int | None = None) -> Array:
         """Simulate an experiment.
@@ -394,171 +359,6 @@ def _cut(design: Design, conditions: Conditions) -> ParameterSet:
         "motor.n_max_rpm": rpm_from_rad_s(conditions.speed_max_rad_s),
     }
     return replace(wanted, values={n: min(v, cut[n]) if n in cut else v for n, v in wanted.values.items()})
-
-
-def _about(middle: float, half: float) -> tuple[float, float]:
-    return middle - half, middle + half
-
-
-def _draw(
-    base: Setup, machine: MachineFile, samples: Samples, row: int, rng: np.random.Generator, I_max: float
-) -> Setup:
-    setup = Setup.from_buffer_copy(base)
-    varied = samples.describe(row)
-    out = setup.machine
-    R = varied.get("R_s_ohm", 1.0)
-    out.R_copper, out.R_fixed = R * out.R_copper, R * out.R_fixed
-    out.L_d, out.L_q = (getattr(out, n) * varied.get(f"{n}_h", 1.0) for n in ("L_d", "L_q"))
-    out.psi_f *= varied.get("psi_f_wb", 1.0)
-    out.J *= varied.get("J_kgm2", 1.0)
-    _draw_elastic_shaft(setup, machine, rng)
-    out.B, out.tau_c = _friction(machine, rng)
-    setup.T_winding, setup.T_magnet, setup.U_dc = (varied[n] for n in ("T_winding_c", "T_magnet_c", "U_dc_v"))
-    if setup.U_dc_ripple > 0.0:
-        setup.U_dc_ripple *= float(rng.uniform(*SEEN_SHARES))
-        setup.U_dc_ripple_hz = float(rng.choice(RIPPLE_HZ))
-    setup.sensors.encoder_offset_e += varied["encoder_rad"]
-    setup.sensors.offset[:] = list(rng.normal(0.0, OFFSET_SHARE * I_max, 3))
-    known = [machine.conditions.get(f"sensor_gain_{phase}_over_mean", 1.0) for phase in "abc"]
-    setup.sensors.gain[:] = list(rng.normal(1.0, MISMATCH, 3) * np.array(known))
-    _draw_eddy_currents(setup, machine, rng)
-    _draw_harmonics(setup, machine, rng)
-    _draw_shaft_effects(setup, machine, rng)
-    _draw_inverter(setup, machine, rng)
-    setup.sensor_lag, setup.sampling_shift, age_s = _timing(machine, rng, late=setup.delay > 0)
-    setup.sensors.encoder_latency = age_s
-    setup.seed = int(rng.integers(2**62))
-    return setup
-
-
-def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
-    """Draw eddy currents about those that the inductances were identified with; none where there were none.
-
-    Within a control period they are nothing but iron loss; slower ones are a branch, whose time constant the plant has
-    once for both axes.
-    """
-    sizes_s = [machine.conditions.get(f"eddy_{axis}_s", 0.0) for axis in "dq"]
-    taus_s = [tau for axis in "dq" if isinstance(tau := machine.conditions.get(f"eddy_{axis}_time_s"), float)]
-    if not taus_s:
-        return
-    out, T_s = setup.machine, machine.inverter.T_s
-    sizes_s = [float(rng.uniform(*SEEN_SHARES)) * size_s for size_s in sizes_s]
-    tau_s = float(np.mean(taus_s)) * math.exp(rng.uniform(-1.0, 1.0) * math.log(EDDY_FACTOR))
-    per_volt = [size_s / L for size_s, L in zip(sizes_s, (out.L_d, out.L_q), strict=True)]
-    if np.mean(taus_s) < T_s:
-        if sum(per_volt) > 0.0:
-            out.R_iron = 2.0 / sum(per_volt)
-            out.B = max(0.0, out.B - iron_drag(out.pole_pairs, out.psi_f, out.R_iron))  # identified as one
-        return
-    out.eddy_rate = 1.0 / max(tau_s, T_s)  # shorter than a step of the plant would not be integrated
-    out.eddy_d, out.eddy_q = (amperes * out.eddy_rate for amperes in per_volt)
-
-
-def _draw_harmonics(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
-    """Draw the 5th and 7th harmonic of the back-EMF.
-
-    About what was identified, at any phase; of a back-EMF of which nothing was identified, within the usual range.
-    """
-    out, seen = setup.machine, machine.estimates
-    for key, (name, order, most) in EMF_HARMONICS.items():
-        found = seen.get(key)
-        share = float(rng.uniform(*SEEN_SHARES)) if found is not None else float(rng.uniform(0.0, 1.0))
-        flux = found.value if found is not None else most * out.psi_f / order
-        setattr(out, name, float(rng.choice((-1.0, 1.0))) * share * flux)
-
-
-def _draw_elastic_shaft(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
-    """Divide the inertia into the two masses that resonance and antiresonance tell; nothing without them."""
-    known, out = machine.machine, setup.machine
-    if known.resonance_hz is None or known.antiresonance_hz is None:
-        return
-    places = {"resonance_hz": known.resonance_hz, "antiresonance_hz": known.antiresonance_hz}
-    halves = {name: doubt(machine, name, place) for name, place in places.items()}
-    w_r, w_a = (
-        2.0 * math.pi * place * float(rng.uniform(*_about(1.0, halves[name]))) for name, place in places.items()
-    )
-    if w_a >= w_r:
-        return
-    out.J_load = out.J * (1.0 - (w_a / w_r) ** 2)
-    out.J -= out.J_load
-    out.coupling_stiffness = out.J_load * w_a**2
-    zeta = (known.resonance_zeta or 0.0) * math.exp(rng.uniform(-1.0, 1.0) * math.log(ZETA_FACTOR))
-    out.coupling_damping = 2.0 * zeta * out.coupling_stiffness / w_r
-
-
-def _draw_shaft_effects(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
-    """Draw what was identified along the shaft: drag, largest order of the cogging, errors and noise of the encoder."""
-    out, seen = setup.machine, machine.conditions
-    for name in ("encoder_once", "encoder_twice"):
-        if isinstance(error_rad := seen.get(f"{name}_rad"), float):
-            setattr(setup.sensors, name, float(rng.uniform(*SEEN_SHARES)) * error_rad)
-    if isinstance(noise_rad := seen.get("encoder_noise_rad"), float):
-        setup.sensors.encoder_noise = noise_rad
-    if isinstance(drag := seen.get("drag_nms2"), float):
-        out.drag = float(rng.uniform(*SEEN_SHARES)) * drag
-    torque_nm, periods = seen.get("cogging_nm"), seen.get("cogging_periods")
-    if isinstance(torque_nm, float) and isinstance(periods, int):
-        out.cogging, out.cogging_periods = float(rng.uniform(*SEEN_SHARES)) * torque_nm, float(periods)
-
-
-def _timing(machine: MachineFile, rng: np.random.Generator, *, late: bool) -> tuple[float, float, float]:
-    """Draw the lag of the current sensors, the sampling instant and the age of the encoder's angle (s).
-
-    About what was identified, else a short lag. What lag and instant do together is known better than either: what one
-    is drawn longer, the other is earlier. An old angle shows at speed what a late sample does: half of the drives have
-    the one, half the other; the age is then all that the d voltage at speed shows, of which a late sample that the
-    square waves at standstill show is only the middle.
-    """
-    shown = machine.conditions.get("shown_instant_s")
-    age = shown if isinstance(shown, float) else 0.0
-    lag, instant, T_s = machine.inverter.current_lag_s, machine.inverter.sampling_instant_s, machine.inverter.T_s
-    where = float(rng.uniform(0.0, 1.0))
-    if lag is None or instant is None:
-        return where * min(max(LAG_S, LAG_SHARES[0] * T_s), LAG_SHARES[1] * T_s), 0.0, 0.0
-    stds = [machine.estimates[name].std for name in (LAG, INSTANT) if name in machine.estimates]
-    apart = (2.0 * where - 1.0) * TIMING_COVERAGE * math.hypot(*stds)
-    shift = max(-T_s, min(T_s, instant - apart))
-    lag_s, shift_s = max(0.0, lag + apart), shift if late else min(0.0, shift)
-    if instant > 0.0 and rng.random() < 0.5:
-        return lag_s, 0.0, max(0.0, shift_s, age - lag_s)
-    return lag_s, shift_s, 0.0
-
-
-def _draw_inverter(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
-    """Draw the inverter's error: every other drive with each edge, where the ripple decides what a dead time does.
-
-    The plateau is dead time and thresholds together; the knee is what charges a leg's output within the dead time.
-    """
-    inverter, out = machine.inverter, setup.inverter
-    nominal = out.dead_time[2]
-    dead = nominal * float(rng.uniform(1.0 - DEAD_SPREAD, 1.0 + DEAD_SPREAD))
-    mismatch = MISMATCH_OF_LEGS * dead * float(rng.uniform(-1.0, 1.0))
-    knee = out.i_knee * math.exp(rng.uniform(-1.0, 1.0) * math.log(KNEE_FACTOR))
-    share = float(rng.uniform(0.0, LARGEST_DROP_SHARE))
-    if rng.random() < 0.5:
-        out.model, out.shape = MODELS.index("averaged"), int(rng.integers(SHAPES.index("atan"), len(SHAPES)))
-        out.i_knee, out.dead_time[:] = knee, [dead] * 3
-        return
-    out.model = MODELS.index("switched")
-    out.dead_time[:] = [(1.0 - share) * t for t in (dead + mismatch, dead - mismatch, dead)]
-    drop = share * dead * setup.U_dc / inverter.T_s
-    out.V_switch, out.V_diode = drop, drop
-    capacitance = 0.5 * knee * (1.0 - share) * dead / setup.U_dc
-    L = min(setup.machine.L_d, setup.machine.L_q)
-    least = library().pmsm_inverter_smallest_capacitance(dead + abs(mismatch), L)
-    out.capacitance = capacitance if capacitance >= least else 0.0
-
-
-def _friction(machine: MachineFile, rng: np.random.Generator) -> tuple[float, float]:
-    """Draw viscous (N m s) and Coulomb friction (N m)."""
-    known = machine.machine
-    torque = abs(known.torque_nm(0.0, known.I_nom_apk or known.I_max_apk or 0.0))
-    omega = rad_s_from_rpm(known.n_nom_rpm or known.n_max_rpm or 3000.0)
-    drawn = []
-    for value, largest in ((known.B_nms, FRICTION_SHARE * torque / omega), (known.tau_c_nm, FRICTION_SHARE * torque)):
-        factor = math.exp(rng.uniform(-1.0, 1.0) * math.log(FRICTION_FACTOR))
-        drawn.append(float(rng.uniform(0.0, largest)) if value is None else factor * value)
-    return drawn[0], drawn[1]
 
 
 def _excite(simulation: Simulation, excitation: Excitation) -> None:

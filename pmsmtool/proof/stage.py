@@ -42,11 +42,12 @@ from pmsmtool.identification.wiring import SUPPLY
 from pmsmtool.machine.parameters import Brake, Load, Shaft
 from pmsmtool.measurement.limits import within_supply
 from pmsmtool.npz_file import npz_bytes, read_npz
+from pmsmtool.proof.drawn_machine import SEEN_SHARES, U_DC_SPREAD
 from pmsmtool.proof.judgement import Judgement, judge, with_ripple
 from pmsmtool.proof.measured import SpeedNotReached, run_experiments
 from pmsmtool.proof.plan import LINK, RPM, Conditions, Experiment, ProofPlan, plan_proof
 from pmsmtool.proof.prediction_file import from_arrays, to_arrays
-from pmsmtool.proof.simulated import RUNS, SEEN_SHARES, U_DC_SPREAD, averaged, predict_proof
+from pmsmtool.proof.simulated import RUNS, averaged, predict_proof
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz

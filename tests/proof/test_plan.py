@@ -20,8 +20,9 @@ from pmsmtool.identification.mechanics import PLAY_FALLBACK
 from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
+from pmsmtool.proof.drawn_machine import EMF_HARMONICS, LAG_SHARES
 from pmsmtool.proof.plan import RPM, SIGNALS, STEPS, Conditions, plan_proof
-from pmsmtool.proof.simulated import BASE_SPEED, EMF_HARMONICS, LAG_SHARES, SimulatedDrives
+from pmsmtool.proof.simulated import BASE_SPEED, SimulatedDrives
 from pmsmtool.proof.stage import ProofRequest, envelope_of
 from pmsmtool.resources import data_folder
 
