@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from html import escape
 from itertools import zip_longest
@@ -81,14 +82,14 @@ class Summary(NamedTuple):
     notes: Sequence[str] = ()
 
 
-class Summarised:
+class Summarised(ABC):
     """A result that shows a table of itself: as text, and as HTML in a notebook."""
 
     __slots__ = ()
 
+    @abstractmethod
     def summary(self) -> Summary:
         """Return what is shown."""
-        raise NotImplementedError
 
     def __repr__(self) -> str:
         shown = self.summary()

@@ -64,6 +64,8 @@ def report_command(
     """
     if anonymous + junit + pdf + follow > 1:
         raise click.UsageError("--anonymous, --junit, --pdf and --follow exclude each other: give one of them")
+    if (follow and path) or (not follow and (seconds or port)):
+        raise click.UsageError("--for and --port belong to --follow, which writes no file (-o)")
     if follow:
         _follow(run, seconds, port, out)
         return
@@ -150,9 +152,8 @@ def _newest(path: Path) -> Path | None:
     """Return the run that is followed: the folder itself, or the newest run in it; None where there is none yet."""
     from pmsmtool.run_directory import RECORD
 
-    return (
-        path if (path / RECORD).is_file() else max((found.parent for found in path.glob(f"*/{RECORD}")), default=None)
-    )
+    runs = [path] if (path / RECORD).is_file() else [record.parent for record in path.glob(f"*/{RECORD}")]
+    return max(runs, default=None)
 
 
 def _files(run: Path) -> list[tuple[str, int]]:

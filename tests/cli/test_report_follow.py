@@ -97,3 +97,6 @@ def test_a_run_is_followed_for_a_time(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "there is no such folder" in capsys.readouterr().err
     assert program(["report", "--follow", "--pdf", str(run.path)]) == 2
     assert "exclude each other" in capsys.readouterr().err
+    for wrong in (["--for", "1s"], ["--port", "8000"], ["--follow", "-o", "x.html"]):
+        assert program(["report", str(run.path), *wrong]) == 2, wrong
+        assert "belong to --follow" in capsys.readouterr().err

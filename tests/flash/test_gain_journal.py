@@ -37,6 +37,14 @@ def change(table: TableDrive, journal: GainJournal, item: DriveObject, value: in
     table.objects[item.index, item.sub] = item.encode(value)
 
 
+def left_changed(table: TableDrive, identity: Identity) -> GainJournal:
+    """A run that has changed one gain and was killed."""
+    journal = journal_of(identity)
+    journal.begin()
+    change(table, journal, GAIN, 210)
+    return journal
+
+
 def test_what_was_left_changed_comes_back_once(rig: tuple[TableDrive, DriveNode, Identity]) -> None:
     table, node, identity = rig
     assert restore_left(node, identity) == 0 and not any_left()
@@ -57,9 +65,7 @@ def test_what_was_left_changed_comes_back_once(rig: tuple[TableDrive, DriveNode,
 @pytest.mark.parametrize("status", [0x0237, 0x0217, 0x021F, 0x0000 | 0x77FF])
 def test_an_energised_drive_keeps_what_it_holds(rig: tuple[TableDrive, DriveNode, Identity], status: int) -> None:
     table, node, identity = rig
-    journal = journal_of(identity)
-    journal.begin()
-    change(table, journal, GAIN, 210)
+    left_changed(table, identity)
     table.objects[0x6041, 0] = STATUSWORD.encode(status)
     with pytest.raises(SafetyRefusal, match="left gains of this drive changed"):
         restore_left(node, identity)
@@ -68,9 +74,7 @@ def test_an_energised_drive_keeps_what_it_holds(rig: tuple[TableDrive, DriveNode
 
 def test_what_neither_held_nor_was_written_is_left_alone(rig: tuple[TableDrive, DriveNode, Identity]) -> None:
     table, node, identity = rig
-    journal = journal_of(identity)
-    journal.begin()
-    change(table, journal, GAIN, 210)
+    left_changed(table, identity)
     table.objects[0x60F6, 2] = RATE.encode(99)
     with pytest.raises(SafetyRefusal, match="0x60F6:02 hold neither"):
         restore_left(node, identity)
@@ -79,9 +83,7 @@ def test_what_neither_held_nor_was_written_is_left_alone(rig: tuple[TableDrive, 
 
 def test_a_gain_that_does_not_come_back_keeps_the_journal(rig: tuple[TableDrive, DriveNode, Identity]) -> None:
     table, node, identity = rig
-    journal = journal_of(identity)
-    journal.begin()
-    change(table, journal, GAIN, 210)
+    journal = left_changed(table, identity)
     with pytest.raises(VerifyMismatch) as caught:
         journal.end(node)
     assert caught.value.differences == ("0x60F6:01 holds d2 00, before 2c 01",) and any_left()
