@@ -106,3 +106,16 @@ def test_a_reference_is_written_in_the_middle_of_its_transfer(monkeypatch: pytes
     assert second == 30.0, "whole counts"
     assert trace["theta_m_rad"][0] == pytest.approx(0.5 * math.pi) and trace["i_q_a"][0] == pytest.approx(0.3)
     assert trace.t_s[0] == 0.0
+
+
+def test_the_torque_is_taken_away_before_a_record_without_step_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reading may last longer than the push, which would go on."""
+    happened: list[object] = []
+    drive = object.__new__(RecorderDrive)
+    drive.node = SimpleNamespace(node=1, put=lambda item, value: happened.append((item, value)))  # type: ignore[assignment]
+    drive.target = SimpleNamespace(cyclic=False, quantity=SimpleNamespace(item="target torque", per_count=0.1))  # type: ignore[assignment]
+    drive._asked_a, drive.may_be_energised = 4.0, False
+    read = Trace(1e-4 * np.arange(3.0), {"i_q_a": np.zeros(3)}, {"i_q_a": "A"}, {"period_s": 1e-4})
+    drive.recorder = SimpleNamespace(fetch=lambda *wanted: happened.append("read") or read)  # type: ignore[assignment]
+    drive.finish_record(Recording(("i_q_a",), 3))
+    assert happened == [("target torque", 0), "read"] and drive._asked_a == 0.0

@@ -234,6 +234,12 @@ def test_unequal_pairs_and_unequal_sensors_are_told_apart(found: Trace, reason: 
     assert caught.value.reason == reason
 
 
+def test_unequal_sensors_are_named_with_their_gains() -> None:
+    named = r"differ by 6\.2 % \(a \+2\.1 %, b -4\.2 %, c \+2\.1 % of their mean\), limit 5 %"
+    with pytest.raises(IdentificationError, match=named):
+        check_pairs(pairs((2.0, 2.0, 2.0), gains=(1.0, 0.94, 1.0)), NOISE, STEP)
+
+
 def test_sensors_that_differ_a_little_are_measured_and_corrected() -> None:
     gains = (1.014, 0.99, 0.996)
     found = check_pairs(pairs((2.0, 2.0, 2.0), gains=gains), NOISE, STEP).mismatch

@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -361,6 +362,21 @@ def test_a_magnet_that_lost_flux_is_told_from_a_warmer_one(T_after_c: float, pop
     for share in (1.0 - 1.1 * MAGNET_CHANGE, 1.0 + 1.1 * MAGNET_CHANGE, 0.97, math.nan):
         with pytest.raises(IdentificationError, match="E_MAGNET_CHANGED"):
             check_magnet(before, again(share), flux, alpha)
+
+
+@pytest.mark.parametrize(("share", "lost"), [(0.9, False), (1.1, True)])
+def test_a_magnet_may_change_by_three_times_the_scatter_of_two_windows(
+    share: float, lost: bool, population: Population
+) -> None:
+    before, flux = population.speeds(0), population.estimate(0)
+    scatter = 0.01  # of the flux linkage; three times that of a pair is 4.2 %
+    noisy = replace(flux, residual_wb=np.full_like(flux.residual_wb, scatter * flux.psi_measured.value))
+    pair = list(fastest_pair(before))
+    rows = {name: values[pair] for name, values in before.signals.items()}
+    rows |= {"u_q_v": (1.0 - share * 3.0 * math.sqrt(2.0) * scatter) * rows["u_q_v"]}
+    again = Trace(before.t_s[:2], rows, before.units)
+    with pytest.raises(IdentificationError, match="E_MAGNET_CHANGED") if lost else nullcontext():
+        check_magnet(before, again, noisy, 0.0)
 
 
 def test_a_wide_interval_takes_the_driven_windows_along() -> None:
