@@ -234,6 +234,8 @@ def _with_truth(
     full_scale = max(float(rng.uniform(*ADC_SPAN)) * I_nom, 1.4 * (machine.I_max_apk or I_nom))
     step = 2.0 * full_scale / 2**12
     slope = float(rng.uniform(*kind.slope_drop_v)) / I_nom
+    if machine.R_s_ohm <= slope:  # no loop has less than its devices: what was drawn is the winding
+        drive = replace(drive, machine=replace(machine, R_s_ohm=machine.R_s_ohm + slope))
     temperature = float(rng.uniform(*T_RANGE_C))
     truth: dict[str, Value] = {
         "inverter_model": "switched",

@@ -32,6 +32,9 @@ DEVICE_SHARE = 0.3
 DEVICES_LEAST_OHM = 0.02
 """What they may have at least, however low the winding: a metre of 0.75 mm2 alone has 23 mohm (0.0175 ohm mm2/m). A
 winding of 21 mohm behind switches of 17 mohm was named the motor of another data sheet."""
+DEVICES_LEAST_V = 0.4
+"""The same at the rated current (peak). Bridges are made for a voltage that is lost, not for a resistance: integrated
+ones of 50 mohm a switch carry 8 A, of 200 mohm 2 A. 30 mohm beside a winding of 8 mohm for 2 A were named so, too."""
 SALIENCY = 3.0
 """Largest L_q/L_d behind a data sheet that states one inductance for both axes."""
 VENDOR_SHARE = 0.15
@@ -293,7 +296,7 @@ def _judged(row: Row, file: MachineFile, found: Mapping[str, _Measured], *, used
     if measured is not None:
         least = measured.value - measured.half
         good = measured.value + measured.half >= low and least <= high
-        if good and row.name == "R_s_ohm" and least * (1.0 - DEVICE_SHARE) > high - DEVICES_LEAST_OHM:
+        if good and row.name == "R_s_ohm" and least * (1.0 - DEVICE_SHARE) > high - _devices_least_ohm(file):
             # another motor's sheet may look the same
             return replace(row, verdict="NOT CHECKED", tolerance=f"{text}; to check it, measure the winding alone")
         return replace(row, verdict="agrees" if good else "contradicts", cause="" if good else _cause(row, measured))
@@ -354,10 +357,10 @@ def _allowed(
         devices = 0.0
         winding_alone = machine.R_winding_ohm == machine.R_s_ohm
         if winding_alone or (name not in file.std and machine.R_winding_ohm is None):
-            devices, least = high * DEVICE_SHARE / (1.0 - DEVICE_SHARE), DEVICES_LEAST_OHM / value
+            devices, least = high * DEVICE_SHARE / (1.0 - DEVICE_SHARE), _devices_least_ohm(file) / value
             up_to = f"{100.0 * DEVICE_SHARE:g} % of the loop"
             if least > devices:
-                devices, up_to = least, f"{1e3 * DEVICES_LEAST_OHM:g} mohm"
+                devices, up_to = least, told(_devices_least_ohm(file), "ohm", 2)
             text = f"{text}, devices and cable up to {up_to}"
         if not T_known:
             cold, hot = (1.0 + machine.alpha_R_per_k * (T - machine.T_ref_c) for T in UNKNOWN_T_RANGE_C)
@@ -378,6 +381,12 @@ def _allowed(
         low, high = (low, high * SALIENCY) if larger else (low / SALIENCY, high)
         text = f"{text}, one value for both axes"
     return low * value, high * value, text
+
+
+def _devices_least_ohm(file: MachineFile) -> float:
+    """Return the resistance that devices and cable may have at least behind this motor (ohm)."""
+    I_nom = file.machine.I_nom_apk
+    return max(DEVICES_LEAST_OHM, DEVICES_LEAST_V / I_nom if I_nom else 0.0)
 
 
 def _share(name: str, file: MachineFile) -> tuple[float, str]:

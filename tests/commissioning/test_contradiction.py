@@ -91,8 +91,18 @@ def test_the_limit_is_the_joint_interval(name: str, share: float, sign: float) -
     assert wrong(outside) == ([] if name == "R_s_ohm" and sign > 0.0 else [name])
     assert wrong(compare(TRUTH, {}, measured(R_s_ohm=1.65 * TRUTH.machine.R_s_ohm))) == ["R_s_ohm"]
     # so it may where a meter read the winding alone, as `machine new` writes it
-    low = replace(TRUTH, machine=replace(TRUTH.machine, R_s_ohm=0.0223))  # a metre of cable has as much
-    for loop, verdict in ((0.033, "agrees"), (0.0377, "NOT CHECKED"), (0.05, "contradicts")):
+    # a metre of cable has 0.02 ohm, a bridge for 6 A 0.07 ohm, one for 2 A 0.2 ohm
+    winding = replace(TRUTH.machine, R_s_ohm=0.0223)
+    for I_nom, loop, verdict in (
+        (50.0, 0.033, "agrees"),
+        (50.0, 0.0377, "NOT CHECKED"),
+        (50.0, 0.05, "contradicts"),
+        (6.08, 0.05, "NOT CHECKED"),
+        (6.08, 0.1, "contradicts"),
+        (2.0, 0.1, "NOT CHECKED"),
+        (2.0, 0.25, "contradicts"),
+    ):
+        low = replace(TRUTH, machine=replace(winding, I_nom_apk=I_nom))
         rows = compare(low, {}, measured(R_s_ohm=loop))
         R_row = next(row for row in rows if row.name == "R_s_ohm")
         assert R_row.verdict == verdict and ("measure the winding" in R_row.tolerance) == (verdict == "NOT CHECKED")
