@@ -269,18 +269,18 @@ class _Redundancy:
         if _unbounded(rows, target):
             return math.inf
         best = -1.0
-        for angle in self.directions:
-            x, direction = self.start, np.array([math.cos(angle), math.sin(angle)])
-            for _ in range(_REFINEMENTS):
-                x = _furthest(rows, shift, radius, direction @ target, x)
-                y = target @ x + self.offset
-                size = float(np.hypot(*y))
-                best = max(best, size - 1.0)
-                if best > REDUNDANT or float(y @ direction) >= size * (1.0 - 1e-7):
-                    break
-                direction, x = y / size, self.start + _PULL * (x - self.start)
-            if best > REDUNDANT:
-                return best
+        directions = np.stack([np.cos(self.directions), np.sin(self.directions)], axis=1)
+        x = np.tile(self.start, (len(directions), 1))
+        for _ in range(_REFINEMENTS):
+            x = _furthest(rows, shift, radius, target, self.offset, directions, x)
+            y = x @ target.T + self.offset
+            size = np.hypot(y[:, 0], y[:, 1])
+            best = max(best, float(size.max()) - 1.0)
+            turning = (y * directions).sum(axis=1) < size * (1.0 - 1e-7)
+            if best > REDUNDANT or not turning.any():
+                break
+            directions = (y / size[:, None])[turning]
+            x = self.start + _PULL * (x[turning] - self.start)
         return best
 
     def _discs(self, k: int) -> tuple[Array, Array, Array]:
@@ -299,39 +299,51 @@ def _unbounded(rows: Array, target: Array) -> bool:
     return bool(free.size and np.abs(target @ free.T).max() > _RANK * np.abs(target).max())
 
 
-def _furthest(rows: Array, shift: Array, radius: Array, objective: Array, x: Array) -> Array:
-    """Maximise objective . x over |rows x + shift| <= radius from a point inside: Newton on a logarithmic barrier."""
-    count, n = len(rows), x.size
+def _furthest(
+    rows: Array, shift: Array, radius: Array, target: Array, offset: Array, directions: Array, x: Array
+) -> Array:
+    """Maximise each direction . (target x) over |rows x + shift| <= radius: Newton on a logarithmic barrier.
+
+    One row of ``x`` (inside) per direction, all in step. Where one has passed the limit there is nothing left to ask.
+    """
+    count, n = len(rows), x.shape[1]
     flat, square = rows.reshape(-1, n), radius**2
     weight = _BARRIER_START * count
+    objective = directions @ target
     while True:
         for _ in range(_NEWTON_STEPS):
-            y = (flat @ x).reshape(-1, 2) + shift
-            room = square - (y * y).sum(axis=1)
-            if float(room.min()) <= _ROUNDING:
-                return x  # on the border to rounding: nothing left to gain
-            slack = 1.0 / room
-            pull = (y[:, 0, None] * rows[:, 0] + y[:, 1, None] * rows[:, 1]) * slack[:, None]
-            gradient = weight * objective - 2.0 * pull.sum(axis=0)
-            hessian = 2.0 * (flat * np.repeat(slack, 2)[:, None]).T @ flat + 4.0 * pull.T @ pull
-            hessian.flat[:: n + 1] += _RIDGE * np.trace(hessian)
+            y = (x @ flat.T).reshape(len(x), -1, 2) + shift
+            room = square - (y * y).sum(axis=2)
+            inside = room.min(axis=1) > _ROUNDING  # else on the border to rounding: nothing left to gain
+            if not inside.any():
+                return x
+            slack = 1.0 / np.maximum(room, _ROUNDING)
+            pull = (y[:, :, 0, None] * rows[:, 0] + y[:, :, 1, None] * rows[:, 1]) * slack[:, :, None]
+            gradient = weight * objective - 2.0 * pull.sum(axis=1)
+            hessian = 2.0 * (flat.T * np.repeat(slack, 2, axis=1)[:, None]) @ flat
+            hessian += 4.0 * pull.transpose(0, 2, 1) @ pull
+            hessian += _RIDGE * np.trace(hessian, axis1=1, axis2=2)[:, None, None] * np.eye(n)
             try:
-                step = np.linalg.solve(hessian, gradient)
+                step = np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0]
             except np.linalg.LinAlgError:  # close to one disc's border all others round away: the shortest step
-                step = np.linalg.lstsq(hessian, gradient)[0]
-            x = x + min(1.0, _STEP_INSIDE * _inside_share((flat @ step).reshape(-1, 2), y, square)) * step
-            if float(gradient @ step) <= _NEWTON_DONE:
+                step = np.stack([np.linalg.lstsq(h, g)[0] for h, g in zip(hessian, gradient, strict=True)])
+            share = _STEP_INSIDE * _inside_share((step @ flat.T).reshape(len(x), -1, 2), y, square)
+            x = x + np.where(inside, np.minimum(1.0, share), 0.0)[:, None] * step
+            if float(np.hypot(*(x @ target.T + offset).T).max()) - 1.0 > REDUNDANT:
+                return x
+            if not (inside & ((gradient * step).sum(axis=1) > _NEWTON_DONE)).any():
                 break
         if count <= _GAP * weight:
             return x
         weight *= _BARRIER_GROWTH
 
 
-def _inside_share(step: Array, y: Array, square: Array) -> float:
-    """Largest share of a step that stays inside every disc."""
-    a, b = (step * step).sum(axis=1), (step * y).sum(axis=1)
-    c = (y * y).sum(axis=1) - square
-    return float(((np.sqrt(b * b - a * c) - b) / np.maximum(a, _TINY)).min())
+def _inside_share(step: Array, y: Array, square: Array) -> Array:
+    """Largest share of each step that stays inside every disc."""
+    a, b = (step * step).sum(axis=2), (step * y).sum(axis=2)
+    c = (y * y).sum(axis=2) - square
+    root = np.sqrt(np.maximum(b * b - a * c, 0.0))
+    return np.asarray(((root - b) / np.maximum(a, _TINY)).min(axis=1))
 
 
 def _independent(rows: Array) -> Array:

@@ -88,6 +88,15 @@ def test_what_is_not_finitely_determined_is_said_so(eps: float | None) -> None:
     assert found.text == "not finitely determined"
 
 
+def test_a_horizon_takes_few_linear_solutions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """267 of all directions at once; 1930 one direction after the other, each to its end."""
+    solved, solve = [], np.linalg.solve
+    monkeypatch.setattr(np.linalg, "solve", lambda *system: solved.append(1) or solve(*system))
+    model = replace(MODULUS_OPTIMUM, T_s=1.01 * T_S)  # one that nothing has asked for yet
+    assert horizon(model, OMEGA, V_MAX, 0.01).k_max is not None
+    assert 0 < len(solved) < 1000
+
+
 @pytest.mark.chain
 @pytest.mark.parametrize(("rpm", "published"), [(0.0, 0), (310.0, 0), (620.0, 14), (800.0, 29)])
 def test_horizons_of_states_that_can_occur_depend_on_speed(rpm: float, published: int) -> None:
