@@ -26,7 +26,7 @@ from pmsmtool.files import read_text
 from pmsmtool.identification.calibration import calibrated_traces
 from pmsmtool.identification.completed_machine import completed_machine
 from pmsmtool.identification.evaluate import tolerance_on
-from pmsmtool.identification.judgement import TOLD_BY, judged, not_told, stage_of, without
+from pmsmtool.identification.judgement import TOLD_BY, judged, stage_of
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method
 from pmsmtool.identification.run_files import MACHINE, place_of
 from pmsmtool.identification.supply_power import resistance_by_supply
@@ -201,8 +201,7 @@ def _by_recorder(
         estimates |= estimate_ratios(pushes, pole_pairs=facts.pole_pairs, tolerance=tolerance)
     except IdentificationError as error:
         missing["J_per_psi"] = error.what
-    reasons = not_told(estimates, pushes)
-    return PulseResult(without(estimates, reasons), missing | reasons)
+    return PulseResult(estimates, missing)
 
 
 def _by_torque(

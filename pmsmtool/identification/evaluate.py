@@ -22,7 +22,6 @@ from pmsmtool.estimators.injection.inductance import FrameAhead, InductanceResul
 from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstant
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.noise import Noise, estimate_noise
-from pmsmtool.estimators.phase_check import PairCheck, check_pairs, check_phases, over_phases
 from pmsmtool.estimators.resistance import (
     R_MEASURED,
     Copper,
@@ -40,6 +39,7 @@ from pmsmtool.identification.cogging import Cogging, cogging_of
 from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
 from pmsmtool.identification.mechanics import NOT_RIGID, of_no_rigid_shaft, pushes_of, with_play_told
+from pmsmtool.identification.phase_check import PairCheck, check_pairs, check_phases, over_phases
 from pmsmtool.identification.sampling import resistance_as_sampled
 from pmsmtool.identification.wiring import Finding, supply_power, supply_under_load
 from pmsmtool.machine.parameters import Estimate

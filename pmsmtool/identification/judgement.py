@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.resistance import at_the_test
@@ -21,7 +19,6 @@ from pmsmtool.identification.verdicts import NOT_ACCEPTED, STEP, Verdicts, verdi
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.run_directory import Acceptance, Stage
-from pmsmtool.trace import Trace
 from pmsmtool.units import format_estimate
 
 TOLD_BY: Mapping[str, tuple[str, ...]] = {
@@ -124,36 +121,6 @@ def stage_of(
         summary="; ".join(filter(None, (summary, *lost, *refused, *given))),
         refused=dict(verdicts.refused),
     )
-
-
-RELUCTANCE_LIMIT = 0.15
-"""Largest torque of the d current, of the magnets', beside which J/psi stands: J/psi was off by 1.1 % where it was 0.02
-(interior-2k2), by 26 % at 0.40 (saturated-pmsyrm) and 24 % at 0.53 (fast-ipm). L_d, on which it depends, is unknown."""
-
-
-def reluctance_share(pushes: Sequence[Trace], L_q_h: float, psi_f_wb: float) -> float:
-    """Return the largest share of the d current's torque in that of the magnets: with L_d = 0."""
-    i_d, i_q = (np.concatenate([push[name] for push in pushes]) for name in ("i_d_a", "i_q_a"))
-    return L_q_h / psi_f_wb * float(np.sum(np.abs(i_d * i_q)) / np.sum(np.abs(i_q)))
-
-
-def not_told(estimates: Mapping[str, Estimate], pushes: Sequence[Trace]) -> dict[str, str]:
-    """Return why estimates of recorded pushes are not given, by their keys.
-
-    Parameters
-    ----------
-    estimates : mapping of str to Estimate
-        ``L_q_app_h``, ``psi_f_wb`` and what else was estimated.
-    pushes : sequence of Trace
-        With ``i_d_a`` and ``i_q_a``.
-    """
-    share = reluctance_share(pushes, estimates["L_q_app_h"].value, estimates["psi_f_wb"].value)
-    if share <= RELUCTANCE_LIMIT or "J_per_psi" not in estimates:
-        return {}
-    return {
-        "J_per_psi": f"this drive lets a d current flow whose torque may be {100.0 * share:.2g} % of the magnets', "
-        f"limit {100.0 * RELUCTANCE_LIMIT:g} %; needs current set-points"
-    }
 
 
 def without(estimates: Mapping[str, Estimate], reasons: Iterable[str]) -> dict[str, Estimate]:

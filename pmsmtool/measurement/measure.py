@@ -20,7 +20,6 @@ from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_enc
 from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
-from pmsmtool.estimators.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
 from pmsmtool.experiments.current_limit import (
@@ -36,6 +35,7 @@ from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.experiments.vector_turn import RAMP_S
 from pmsmtool.identification.evaluate import flux_of, resistance_of, tolerance_on
+from pmsmtool.identification.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
 from pmsmtool.identification.request import steps_of
 from pmsmtool.identification.run_files import entry

@@ -6,12 +6,17 @@ With i_d = 0 the torque is 1.5 p psi i_q. Divided by J and integrated over a pus
     w(t) = (1.5 p psi / J) int i_q dt - (tau_c / J) int sgn(w) dt - (B / J) int w dt + w_0
 
 One linear regression over all pushes, each with its own w_0, gives 1.5 p psi/J and tau_c/J, hence J/psi and tau_c/psi.
+A drive that does not decouple its current loops lets a d current flow, and (L_d - L_q) i_d i_q adds to the torque. i_d
+is measured, or it is a high pass of omega i_q: what a PI of d without feed-forward leaves of the voltage omega L_q i_q,
+when its zero lies on the pole of the winding. One more coefficient takes it up, unless that changes J/psi by less
+than it is known to then.
 The speed is the slope of the counted position over a block, the current a mean over it; both at any rate up to the
 control period. The spread is a jackknife over the pushes: what is wrong with one is the same in all its samples.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from typing import TypeVar
@@ -19,12 +24,14 @@ from typing import TypeVar
 import numpy as np
 
 from pmsmtool.arrays import Array
+from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import CONDITION_LIMIT, SensorTolerance, statistical_half_width
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace
 
+Part = tuple[Array, ...]
 Push = TypeVar("Push")
 
 STAGE = "inertia over flux linkage"
@@ -35,6 +42,12 @@ SKIP_SHARE = 0.12
 """Beginning of a push that is left out: the current is still rising."""
 STILL = 0.05
 """Blocks slower than this share of the push's largest speed are left out: friction changes its sign there."""
+LAGS_S = tuple(0.005 * 2.0 ** (0.5 * k) for k in range(11))
+"""Time constants (s) of the high pass; one below them gives the slope of omega i_q, as the first one nearly does."""
+SATURATED_SHARE = 0.15
+"""Of what the d current's torque changes in J/psi, what is left open: saturation changes L_d - L_q; seen: 0.13."""
+SURELY = 2.0
+"""Standard deviations by which that torque changes J/psi where it is taken up; less is noise."""
 RATIO_LIMIT = 0.10
 """Largest relative statistical 95 % half width of J/psi."""
 MODEL_FLOOR = 0.01
@@ -52,7 +65,7 @@ def estimate_ratios(
     Parameters
     ----------
     pushes : sequence of Trace
-        ``theta_M_rad`` (unwrapped) and ``i_q_a`` under one command each; speed may pass zero.
+        ``theta_M_rad`` (unwrapped), ``i_q_a``, ``i_d_a`` if known, under one command each; speed may pass zero.
     pole_pairs : int
         Pole pairs.
     tolerance : SensorTolerance
@@ -64,16 +77,23 @@ def estimate_ratios(
         ``E_EXCITATION``, ``E_NOT_IDENTIFIABLE``.
     """
     tolerance = tolerance or SensorTolerance()
-    parts = [part for part in (_part(push) for push in pushes) if part is not None]
-    if len(parts) < LEAST_PUSHES:
-        raise refuse("E_EXCITATION", f"{len(parts)} usable torque pulses, {LEAST_PUSHES} needed", stage=STAGE)
-    sense = math.copysign(1.0, sum(float(p[0][-1] - p[0][0]) * float(p[1][-1]) for p in parts))
-    full = _ratios(parts, sense, pole_pairs)
+    parts = [part for part in (_part(push, LAGS_S[0]) for push in pushes) if part is not None]
     n = len(parts)
-    std = np.sqrt(jackknife_variance(lambda kept: _ratios(kept, sense, pole_pairs), parts))
-    weakest = min(abs(float(p[1][-1]) / float(p[4][-1])) for p in parts)
+    if n < LEAST_PUSHES:
+        raise refuse("E_EXCITATION", f"{n} usable torque pulses, {LEAST_PUSHES} needed", stage=STAGE)
+    sense = math.copysign(1.0, sum(float(p[0][-1] - p[0][0]) * float(p[1][-1]) for p in parts))
+    (full, std), left_open = _with_spread(parts, sense, pole_pairs, 3), 0.0
+    with contextlib.suppress(IdentificationError):  # a d current that is zero, or follows the current as speed does
+        lags = LAGS_S[1:] if all("i_d_a" not in push.signals for push in pushes) else ()
+        others = [[part for part in (_part(push, lag) for push in pushes) if part is not None] for lag in lags]
+        best = min((parts, *others), key=lambda tried: _fit(tried, sense, 4)[1])
+        salient, its_std = _with_spread(best, sense, pole_pairs, 4)
+        if max(std[0], abs(full[0] - salient[0]) / SURELY) > its_std[0]:
+            left_open = SATURATED_SHARE * abs(full[0] - salient[0])
+            full, std = salient, its_std
+    weakest = min(abs(float(p[1][-1]) / float(p[-1][-1])) for p in parts)
     floors = (
-        full[0] * math.hypot(tolerance.current_gain, MODEL_FLOOR),
+        math.hypot(full[0] * tolerance.current_gain, full[0] * MODEL_FLOOR, left_open),
         math.hypot(full[1] * tolerance.current_gain, FRICTION_FLOOR * torque_per_ampere(pole_pairs, weakest)),
     )
     rows = sum(len(p[0]) for p in parts)
@@ -92,43 +112,63 @@ def estimate_ratios(
     return found
 
 
-def _part(push: Trace) -> tuple[Array, Array, Array, Array, Array] | None:
-    """Return speed, integrals of current, of the sign of speed and of speed, and time, at the blocks of a push."""
+def _part(push: Trace, lag_s: float) -> Part | None:
+    """Return speed, integrals of current, sign of speed, speed and i_d i_q, and time, at the blocks of a push."""
     skip = round(SKIP_SHARE * len(push))
     size = (len(push) - skip) // BLOCKS
     if size < 1:
         return None
-    signals = (push.t_s, push["theta_M_rad"], push["i_q_a"])
-    t, theta, i = (np.asarray(values, dtype=np.float64)[skip:] for values in signals)
-    edges = np.arange(BLOCKS + 1) * size
+    t, theta, i = (np.asarray(values, dtype=np.float64) for values in (push.t_s, push["theta_M_rad"], push["i_q_a"]))
+    edges = skip + np.arange(BLOCKS + 1) * size
     edges[-1] = min(edges[-1], len(t) - 1)
     spans = np.diff(t[edges])
     if np.any(spans <= 0.0):
         return None
     w = np.diff(theta[edges]) / spans
-    charge = np.concatenate(([0.0], np.cumsum(0.5 * (i[1:] + i[:-1]) * np.diff(t))))
     middle = 0.5 * (t[edges[1:]] + t[edges[:-1]])
-    q = np.interp(middle, t, charge)
+    i_d = np.asarray(push["i_d_a"]) if "i_d_a" in push.signals else _left_of_slope(t, theta, i, size, lag_s)
+    charge, reluctance = (
+        np.interp(middle, t, np.concatenate(([0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * np.diff(t)))))
+        for x in (i, i * i_d)
+    )
     way = np.interp(middle, t, theta - theta[0])
     sign = np.sign(w)
     signs = np.concatenate(([0.0], np.cumsum(0.5 * (sign[1:] + sign[:-1]) * np.diff(middle))))
     moving = np.abs(w) >= STILL * np.abs(w).max()
     if moving.sum() < BLOCKS // 2:
         return None
-    return w[moving], q[moving], signs[moving], way[moving], (middle - t[0])[moving]
+    return tuple(x[moving] for x in (w, charge, signs, way, reluctance, middle - t[skip]))
 
 
-def _ratios(parts: Sequence[tuple[Array, ...]], sense: float, pole_pairs: int) -> Array:
-    """Return J/psi and tau_c/psi; the constants of the pushes are projected out."""
-    columns = [np.concatenate([part[k] - part[k].mean() for part in parts]) for k in (1, 2, 3)]
-    w = np.concatenate([part[0] - part[0].mean() for part in parts])
-    signed = [sense * columns[0], *columns[1:]]
-    rise, slowing = regress(signed, w, what="current and friction", stage=STAGE)[:2]
-    friction = -slowing
-    if rise == 0.0:
-        raise refuse("E_EXCITATION", "the shaft does not answer the current", stage=STAGE)
-    ratio = torque_per_ampere(pole_pairs, 1.0) / rise
-    return np.array([ratio, friction * ratio])
+def _left_of_slope(t: Array, theta: Array, i: Array, size: int, lag_s: float) -> Array:
+    """Return the high pass of speed times current; the speed is a slope over a block."""
+    k = np.arange(len(t))
+    before, after = np.maximum(k - size // 2 - 1, 0), np.minimum(k + size // 2 + 1, len(t) - 1)
+    product = (theta[after] - theta[before]) / (t[after] - t[before]) * i
+    left = [0.0]
+    for kept, step in zip(np.exp(-np.diff(t) / lag_s), np.diff(product), strict=True):
+        left.append(float(kept * (left[-1] + step)))
+    return np.array(left)
+
+
+def _with_spread(parts: Sequence[Part], sense: float, pole_pairs: int, columns: int) -> tuple[Array, Array]:
+    """Return J/psi and tau_c/psi, and their standard deviations."""
+
+    def ratios(kept: Sequence[Part]) -> Array:
+        rise, slowing = _fit(kept, sense, columns)[0][:2]
+        if rise == 0.0:
+            raise refuse("E_EXCITATION", "the shaft does not answer the current", stage=STAGE)
+        return np.array([1.0, -slowing]) * (torque_per_ampere(pole_pairs, 1.0) / float(rise))
+
+    return ratios(parts), np.sqrt(jackknife_variance(ratios, parts))
+
+
+def _fit(parts: Sequence[Part], sense: float, columns: int) -> tuple[Array, float]:
+    """Return coefficients and squared residual; the constants of the pushes are projected out."""
+    centred = [np.concatenate([part[k] - part[k].mean() for part in parts]) for k in range(1 + columns)]
+    w, signed = centred[0], [sense * centred[1], *centred[2:]]
+    found = regress(signed, w, what="current and friction", stage=STAGE)
+    return found, float(np.sum((w - np.column_stack(signed) @ found) ** 2))
 
 
 def regress(columns: Sequence[Array], measured: Array, *, what: str, stage: str) -> Array:
