@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from pathlib import Path
 
 import canopen
@@ -17,7 +18,7 @@ from pmsmtool.params.catalogue import CATALOGUE, layout_signature
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.node.dictionary import Dictionary
 from pmsmtool.sim.node.eds import FILE_NAME, MAP_NAME, eds_text
-from pmsmtool.sim.node.objects import build_rows, object_rows
+from pmsmtool.sim.node.objects import ObjectRow, build_rows, object_rows
 from tests.node.bench import Bench
 
 FOLDER = data_folder("firmware-params") / "pmsmsim"
@@ -121,3 +122,14 @@ def test_every_readable_object_can_be_read_and_every_default_is_within_its_bound
     for entry in Dictionary(1):
         if entry.row.type not in ("DOMAIN", "VSTR"):
             entry.check(entry.value)
+
+
+def test_the_bounds_of_a_number_are_those_stated_within_those_of_its_type() -> None:
+    def bounds(kind: str, low: float | None, high: float | None) -> tuple[float, float]:
+        row = ObjectRow(0x6075, 0, "", "", kind, "rw", "0", "", "", low, high, stored=False)
+        return row.bounds
+
+    assert bounds("U16", None, None) == (0.0, 65535.0)
+    assert bounds("I8", -200.0, 5.0) == (-128.0, 5.0)
+    assert bounds("U32", 1.0, 1e12) == (1.0, 2.0**32 - 1.0)
+    assert bounds("REAL32", None, 2.0) == (-math.inf, 2.0)

@@ -125,7 +125,7 @@ class ForeignDrive:
             entry = Entry(row, dictionary.node)
             law = self.laws.get((index, sub))
             if law is not None and law.set_up is not None:
-                low, high = _bounds(row)
+                low, high = row.bounds
                 entry.value = entry.encode(min(max(law.set_up, low), high))  # no more than the drive can give
             if (index, sub) in SERIALS and entry.code is not None:
                 entry.value = entry.encode(serial)
@@ -218,7 +218,7 @@ def assumptions_of(file: str, machine_file: MachineFile | None = None) -> tuple[
 def _within(objects: MakersObjects, set_up: SetUp) -> SetUp:
     """Return the motor with no more rated current than the drive's own object of it holds, and so much less torque."""
     shares = [
-        float(objects.rows[law.index, law.sub].high or math.inf) / law.set_up
+        float(objects.rows[law.index, law.sub].bounds[1] or math.inf) / law.set_up
         for law in laws_of(objects, set_up).values()
         if (law.index, law.sub) in RATED and law.set_up
     ]
@@ -226,12 +226,8 @@ def _within(objects: MakersObjects, set_up: SetUp) -> SetUp:
     return replace(set_up, i_nom_apk=share * set_up.i_nom_apk, torque_nm=share * set_up.torque_nm)
 
 
-def _bounds(row: ObjectRow) -> tuple[float, float]:
-    return (-math.inf if row.low is None else row.low), (math.inf if row.high is None else row.high)
-
-
 def _holds(row: ObjectRow, value: float) -> bool:
-    low, high = _bounds(row)
+    low, high = row.bounds
     return low <= value <= high
 
 

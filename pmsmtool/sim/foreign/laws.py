@@ -72,15 +72,15 @@ def position_units(objects: MakersObjects, counts: int) -> float:
 
 
 def encoder_resolution(objects: MakersObjects, counts: int) -> float:
-    """Return what 0x608F:01 holds once the motor is entered, as near as the file's limits let it.
+    """Return what 0x608F:01 holds once the motor is entered, as near as its type and the file's limits let it.
 
     A file's own number stays where the object cannot be written, and where position has other units anyway.
     """
     row, wanted = objects.rows.get((0x608F, 1)), wanted_resolution(objects, counts)
     if row is None or not row.data_type.letter or row.access != "rw":
         return wanted
-    low, high = (1.0 if row.low is None else row.low), (math.inf if row.high is None else row.high)
-    return float(round(min(max(wanted, low), high)))
+    low, high = row.bounds
+    return float(round(min(max(wanted, low, 1.0), high)))
 
 
 def wanted_resolution(objects: MakersObjects, counts: int) -> float:

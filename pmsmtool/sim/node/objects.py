@@ -12,6 +12,7 @@ too, 0 neither; ``default``, ``low``, ``high``; ``store`` y: kept by 0x1010.
 from __future__ import annotations
 
 import csv
+import math
 import struct
 from dataclasses import dataclass
 from functools import cache
@@ -51,6 +52,15 @@ class ObjectRow:
     def data_type(self) -> DataType:
         """Type of the value."""
         return BY_SHORT[self.type]
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Least and largest number: what is stated, within what a whole number of the type holds."""
+        kind, low, high = self.data_type, -math.inf, math.inf
+        if kind.is_integer:
+            span = 2.0 ** (8 * kind.size)
+            low, high = (-0.5 * span, 0.5 * span - 1.0) if kind.is_signed else (0.0, span - 1.0)
+        return max(low, low if self.low is None else self.low), min(high, high if self.high is None else self.high)
 
     def default_number(self, node: int) -> float:
         """Return the default as a number, ``$NODEID`` replaced."""
