@@ -274,12 +274,14 @@ def test_a_vector_that_turns_between_two_reads_is_no_excess(bench: SimBench, mon
     ],
 )
 def test_budgets_end_an_experiment(bench: SimBench, envelope: Envelope, quantity: str) -> None:
-    with pytest.raises(LimitExceeded, match=quantity), guarded(bench.drive, envelope) as guard:
+    with pytest.raises(LimitExceeded, match=quantity) as caught, guarded(bench.drive, envelope) as guard:
+        assert guard.energy_j == guard.energised_s == 0.0, "nothing is counted before it is energised"
         guard.write({"motor.R_s_ohm": 3.6})
         guard.enable()
         for angle in range(100):
             guard.command_current(2.5, 0.0, fixed_angle_rad=0.3 * angle)
             guard.wait(0.1)
+    assert "locked" not in caught.value.likely, "the shaft may turn"
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
 
 
