@@ -76,6 +76,15 @@ def test_drive_that_ignores_the_heartbeat_is_refused_and_stopped(bench: SimBench
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
 
 
+def test_the_proof_itself_stops_what_it_has_enabled(bench: SimBench) -> None:
+    """Not only the guard around it, which comes later."""
+    heartbeat = Heartbeat(bench.connection)
+    with pytest.raises(SafetyRefusal, match="still enabled"):
+        bench.session.consumer.heard = lambda node: None  # type: ignore[method-assign]
+        prove_dead_man(bench.drive, heartbeat)
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
 def stalling(bench: SimBench, monkeypatch: pytest.MonkeyPatch, stalls: int) -> list[float]:
     """Let the computer stand still behind the first question for the state in each of so many measurements."""
     state, begun = bench.drive.node.state, Heartbeat.stop
