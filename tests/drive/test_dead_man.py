@@ -169,6 +169,15 @@ def test_the_entry_a_killed_run_left_is_freed_and_an_owners_is_kept(bench: SimBe
     assert int.from_bytes(bench.drive.node.sdo.read(0x1016, 1), "little") == after
 
 
+def test_an_entry_that_watches_the_tool_already_is_taken_before_a_free_one(bench: SimBench) -> None:
+    """Two entries for one node are refused by many drives (CiA 301, object 0x1016)."""
+    sdo = bench.drive.node.sdo
+    sdo.download(0x1016, 2, (TOOL_NODE << 16 | 777).to_bytes(4, "little"))
+    with guarded(bench.drive, ENVELOPE):
+        words = [int.from_bytes(sdo.read(0x1016, sub), "little") for sub in (1, 2)]
+    assert words == [0, TOOL_NODE << 16 | CONSUMER_MS]
+
+
 def test_killed_tool_stops_the_machine(bench: SimBench) -> None:
     with guarded(bench.drive, ENVELOPE) as guard:
         guard.enable()
