@@ -170,7 +170,7 @@ ERROR_CAUSES: dict[int, str] = {
     0x7305: "the encoder's cable or supply; its index is missing; another encoder than is set",
     0x2350: "more current, or for longer, than the winding can carry",
     0x3210: "the shaft was braked and nothing takes its energy: no chopper, or a supply that cannot sink",
-    0x3220: "the supply is in current limit, or too weak: raise its limit, or go on with a lower --i-max",
+    0x3220: "the supply is off, too weak, or in current limit: raise its limit, or go on with a lower --i-max",
     0x4310: "the winding is still warm from what ran before: let it cool, then go on",
 }
 """Likely cause of some of them."""

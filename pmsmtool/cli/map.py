@@ -71,7 +71,7 @@ def learn_command(
     checked. Exit code 0: everything decided; 1: a published scale is contradicted; 6: nothing decided; 10: some.
     """
     from pmsmtool.cli.consent import ask_motion
-    from pmsmtool.drive.envelope import Envelope, largest_acceleration
+    from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
     from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.map_gate import check_motion
@@ -108,6 +108,7 @@ def learn_command(
         envelope = Envelope(
             i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S, shaft=motion.shaft or "free",
             load=motion.load, brake=motion.brake, acceleration_rad_s2=largest_acceleration(machine, i_max),
+            voltage_speed_rad_s=voltage_speed(file, i_max),
         )  # fmt: skip
         refuse_unsafe(node, envelope)
         lines = [

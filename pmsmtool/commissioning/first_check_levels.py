@@ -143,7 +143,7 @@ def check_below_full(
                     judged.append(judge_supply(rest_v, turn, stated.inverter.U_dc_v))
             rows = [row for row in rows if row.looked_at not in {each.looked_at for each in judged}] + judged
         except IdentificationError as error:
-            rows.append(Finding("shaft", WRONG, error.what, error.likely + "; an open phase; the encoder's sign"))
+            rows.append(Finding("shaft", WRONG, error.what, error.likely + ("; an open phase" if turns else "")))
         except NotAvailable as refused:  # mode 11: announced in 0x6502, and refused when it is asked for
             if not turns:
                 raise

@@ -35,6 +35,8 @@ STORE_TIMEOUT_S = 10.0
 STORE_POLL_S = 0.1
 READY_TIMEOUT_S = 3.0
 """After boot-up a node answers SDO requests within this time."""
+LEAST_LINK_V = 5.0
+"""A DC link below this has no supply; the smallest drives of this kind work from about 10 V."""
 POLL_S = 0.005
 IDENTITY_BYTES = 4
 LONGEST_NAME = 256
@@ -254,9 +256,18 @@ class DriveNode:
         raise DriveFault(
             f"the drive stays in {state_text(state)} and does not enable",
             where=f"node {self.node}, 0x6041:00",
-            likely="no DC-link voltage, or a missing hardware enable or safe-torque-off input",
+            likely=self._kept_off_by(),
             hint="check the supply and the enable inputs",
         )
+
+    def _kept_off_by(self) -> str:
+        """Return why the drive may not enable: its DC link (0x6079), where shown, separates supply and inputs."""
+        link_mv = self.held(objects.DC_LINK_MV)
+        if link_mv is None:
+            return "no DC-link voltage, or a missing hardware enable or safe-torque-off input"
+        if 1e-3 * link_mv < LEAST_LINK_V:
+            return f"the supply of the power stage is off: the DC link has {1e-3 * link_mv:.3g} V"
+        return f"the safe-torque-off (STO) or enable input is open; the DC link has {1e-3 * link_mv:.4g} V"
 
     def disable_voltage(self, timeout_s: float = STATE_TIMEOUT_S) -> State | None:
         """Remove the voltage; return the state that the statusword then shows."""

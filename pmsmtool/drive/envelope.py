@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 from pmsmtool.errors import SafetyRefusal
+from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Brake, Load, MachineParameters, Shaft
 from pmsmtool.units import format_current, rpm_from_rad_s
 
@@ -15,6 +16,11 @@ OFF_S = 0.5
 consumer time and its reaction (``guard``, ``heartbeat``, ``dead_man``)."""
 LEAST_INERTIA = 0.8
 """Of the one that is given: a data sheet's is true to 20 %."""
+MOST_LINK, LEAST_FLUX, MOST_INDUCTANCE = 1.1, 0.8, 1.3
+"""Of what is given: a supply at its upper tolerance; a data sheet's flux linkage (10 %) with hot magnets; its
+inductance."""
+SIX_STEP = 2.0 / math.pi
+"""Largest phase voltage amplitude, of the DC link: a controller may overmodulate up to six steps."""
 _ANGLES = tuple(math.radians(5.0 * k) for k in range(13))
 # Of the current vector, from the q axis towards negative d: the largest torque lies within 45 degrees, and is flat.
 
@@ -49,6 +55,8 @@ class Envelope:
         What pulls on it, and the holding brake.
     acceleration_rad_s2 : float or None
         Of the shaft by the largest current (mechanical), None where the inertia is not known.
+    voltage_speed_rad_s : float
+        Mechanical speed above which the voltage allows no torque; infinity where it is not known.
     """
 
     i_max_apk: float
@@ -61,6 +69,7 @@ class Envelope:
     brake: Brake = "none"
     acceleration_rad_s2: float | None = None
     i_d_max_apk: float = math.inf
+    voltage_speed_rad_s: float = math.inf
 
     def lines(self) -> list[str]:
         """Return the envelope as a person reads it before consenting."""
@@ -68,8 +77,13 @@ class Envelope:
         if self.acceleration_rad_s2 is None:
             gain = "the speed gained until then is not known (no inertia is given)"
         else:
-            gained = float(f"{rpm_from_rad_s(self.acceleration_rad_s2 * OFF_S):.3g}")
-            gain = f"until then full torque adds up to {gained:g} rpm"
+            gained = rpm_from_rad_s(self.acceleration_rad_s2 * OFF_S)
+            reached = max(rpm, rpm_from_rad_s(self.voltage_speed_rad_s))
+            gain = (
+                f"until then full torque adds up to {float(f'{gained:.3g}'):g} rpm"
+                if rpm + gained < reached
+                else f"until then full torque may reach {float(f'{reached:.3g}'):g} rpm, where the voltage ends it"
+            )
         travel = "not limited" if math.isinf(self.travel_rad) else f"{math.degrees(self.travel_rad):.4g} deg (mech)"
         energy = "not limited" if math.isinf(self.energy_j) else f"{self.energy_j:.4g} J"
         return [
@@ -108,3 +122,16 @@ def largest_acceleration(machine: MachineParameters, i_max_apk: float) -> float 
         return None
     torque = max(machine.torque_nm(-i_max_apk * math.sin(angle), i_max_apk * math.cos(angle)) for angle in _ANGLES)
     return torque / (LEAST_INERTIA * machine.J_kgm2)
+
+
+def voltage_speed(known: MachineFile, i_max_apk: float) -> float:
+    """Return the mechanical speed (rad/s) above which no current up to one (A peak) gives torque; infinity if none is.
+
+    That is where the voltage of six steps cannot hold the flux that the whole current on -d leaves, with the tolerances
+    of a data sheet: U_dc 2 / pi = p omega (psi_f - L_d I).
+    """
+    machine = known.machine
+    left_wb = LEAST_FLUX * machine.psi_f_wb - MOST_INDUCTANCE * machine.L_d_h * i_max_apk
+    if not left_wb > 0.0:
+        return math.inf
+    return SIX_STEP * MOST_LINK * known.inverter.U_dc_v / (left_wb * machine.pole_pairs)

@@ -27,8 +27,6 @@ from pmsmtool.drive_maps.wire_units import wire_unit
 from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.trace import Trace
 
-DC_LINK_MV = objects.DriveObject(0x6079, 0, "I")
-
 
 class ParameterDrive(CanopenDrive):
     """A drive that holds parameters and is not moved."""
@@ -70,7 +68,7 @@ class TorqueDrive(TorqueCurrent, StandardDrive):
         try:
             signal = self.node.map.signals.get(name)
             if signal is None and name == "U_dc_v":
-                return 1e-3 * self.node.get(DC_LINK_MV)
+                return 1e-3 * self.node.get(objects.DC_LINK_MV)
             if signal is not None:
                 shown = objects.DriveObject(signal.index, signal.sub, LETTERS[signal.wire])
                 return wire_unit(signal.unit).scale * self.node.get(shown)

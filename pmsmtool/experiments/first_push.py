@@ -118,5 +118,10 @@ def _held(drive: Drive, i_a: float, error: IdentificationError, link: bool) -> T
         rows.append({"i_command_a": current, **_shown(drive, link), "way_rad": 0.0})
     drive.command_current(0.0, 0.0)
     if all(row["i_q_a"] / row["i_command_a"] > CURRENT_FLOWS for row in rows):
-        raise error
+        raise IdentificationError(
+            error.reason, "the shaft does not move under a torque pulse, and the current flows", where=error.where,
+            likely="the encoder does not count (its cable or supply), a locked shaft or a closed brake, or a "
+            "commutation that is not set up",
+            hint=error.hint,
+        ) from error  # fmt: skip
     return table(rows, [HELD_S * k for k in range(len(rows))])

@@ -93,8 +93,8 @@ def acceleration_per_ampere(drive: Drive, i_test_a: float, answered: Callable[[f
         "E_EXCITATION",
         "the shaft does not move under a torque pulse",
         where="torque pulse",
-        likely="a locked shaft or a closed brake, a motor lead that is not connected, or a drive whose commutation is "
-        "not set up",
+        likely="a locked shaft or a closed brake, an encoder that does not count, a motor lead that is not connected, "
+        "or a drive whose commutation is not set up",
         hint="free the shaft, run the maker's own set-up first; `pmsmtool check` looks at the wiring",
     )
 

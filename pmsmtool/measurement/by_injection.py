@@ -9,7 +9,7 @@ from typing import Any
 
 from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.envelope import Envelope, largest_acceleration
+from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import ConfigError
 from pmsmtool.experiments.rotation import dwell_within
@@ -113,6 +113,7 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
         load=request.load,
         brake=request.brake,
         acceleration_rad_s2=largest_acceleration(machine, i_max),
+        voltage_speed_rad_s=voltage_speed(nameplate, i_max),
         i_d_max_apk=machine.I_nom_apk if i_d_min is None else -i_d_min,
     )
 

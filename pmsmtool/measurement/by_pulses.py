@@ -17,7 +17,7 @@ from dataclasses import replace
 
 from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration
+from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive, guarded
 from pmsmtool.drive.motion_objects import allowed, current_limits, rated_apk, speed_limits, trips_itself
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
@@ -246,6 +246,7 @@ def envelope_of(drive: CanopenDrive, request: IdentifyRequest, known: MachineFil
         load=request.load,
         brake=request.brake,
         acceleration_rad_s2=None if known is None else largest_acceleration(known.machine, i_max),
+        voltage_speed_rad_s=math.inf if known is None else voltage_speed(known, i_max),
     )
 
 

@@ -25,7 +25,7 @@ from pmsmtool.design.prediction import Prediction
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.envelope import Envelope, largest_acceleration
+from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import (
     ConfigError,
@@ -155,6 +155,7 @@ def envelope_of(design: Design, request: ProofRequest, plan: ProofPlan | None = 
         load=request.load,
         brake=request.brake,
         acceleration_rad_s2=largest_acceleration(design.machine.machine, i_max),
+        voltage_speed_rad_s=voltage_speed(design.machine, i_max),
     )
 
 

@@ -56,6 +56,7 @@ def test_the_first_wrong_row_is_what_was_done(extra: str, wrong: str, tool: Tool
     assert code == (1 if wrong else 0)
     assert "duration  at most 15 s" in told and "travel    450 deg" in told
     assert ("voltage off, drive restored" in told) == (extra != "U_dc_v = 300.0")
+    assert ("input is open; the DC link has 540 V" in told) == ("safe_torque_off" in extra)
 
 
 def test_nothing_moves_without_consent(tool: Tool) -> None:

@@ -169,6 +169,8 @@ def test_the_pulses_of_identify_show_a_missing_current_and_a_wrong_sign(seed: in
         ("leads_swapped=true", 10, "encoder sign: the position falls under positive torque"),
         ("phase_open=a", 6, "an open phase, or the supply in current limit"),
         ("drive_fault=not_connected", 6, "a motor lead that is not connected"),
+        ("drive_fault=encoder_stuck", 6, "an encoder that does not count"),
+        ("drive_fault=safe_torque_off", 4, "the safe-torque-off (STO) or enable input is open; the DC link has 540 V"),
     ],
 )
 def test_identify_names_wrong_wiring_of_an_epos4(tool: Tool, key: str, code: int, named: str) -> None:

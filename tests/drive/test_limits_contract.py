@@ -23,7 +23,7 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import AbortConnection, QuickStop, State
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
-from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration
+from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import FRESH_S, LOCKED_TRAVEL_RAD, OVERSHOOT, WATCH_S, GuardedDrive, guarded
 from pmsmtool.drive.heartbeat import PERIOD_S
 from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
@@ -38,7 +38,8 @@ from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveFault, Interrupted, LimitExceeded, PmsmtoolError, SafetyRefusal, StopNotConfirmed
 from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
-from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import InverterParameters, MachineParameters
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.session import Session
@@ -458,6 +459,20 @@ def test_the_envelope_says_what_a_failure_adds_in_speed() -> None:
     assert salient == pytest.approx(1176.7, rel=1e-3), "its reluctance torque at some 20 degrees"
     assert largest_acceleration(replace(machine, J_kgm2=None), 4.0) is None
     assert "not known (no inertia is given)" in ENVELOPE.lines()[5]
+
+
+def test_the_voltage_ends_what_a_failure_adds_in_speed() -> None:
+    """48 V, 11.51 mWb, 0.1875 mH, 4 pole pairs, 1.414 A: 1.1 x 48 x 2/pi over 4 (0.8 psi - 1.3 L I) is 948 rad/s."""
+    machine = MachineParameters(4, 0.2069, 0.1875e-3, 0.1875e-3, 11.51e-3, J_kgm2=3e-5)
+    known = MachineFile("light", machine, InverterParameters(U_dc_v=48.0, f_s_hz=25e3))
+    speed = voltage_speed(known, 1.414)
+    assert speed == pytest.approx(33.614 / (4.0 * (9.208e-3 - 0.3447e-3)), rel=1e-3)
+    light = replace(ENVELOPE, acceleration_rad_s2=24_000.0, voltage_speed_rad_s=speed)
+    assert light.lines()[5].endswith("until then full torque may reach 9050 rpm, where the voltage ends it")
+    assert "adds up to" in replace(light, acceleration_rad_s2=10.0).lines()[5]
+    fast = replace(light, speed_max_rad_s=2.0 * speed)
+    assert "may reach 18100 rpm" in fast.lines()[5], "a shaft that is allowed more is not stopped by its voltage"
+    assert math.isinf(voltage_speed(known, 100.0)), "this current weakens the whole flux"
 
 
 def test_the_first_torque_pulse_is_small_and_short() -> None:

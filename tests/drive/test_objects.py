@@ -7,7 +7,7 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable
 
-from pmsmtool.drive import motion_objects, objects, set_point, standard_drive, torque_drives
+from pmsmtool.drive import motion_objects, objects, set_point, standard_drive
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Recording, Shape
 from pmsmtool.resources import data_folder
@@ -37,7 +37,7 @@ MEANT = {
     "ABORT_CONNECTION": "Abort connection option code", "AVERAGE_COMMAND": "Command",
     "AVERAGE_PERIODS": "Window length", "AVERAGE_STATE": "State", "CONFIGURATION_DATE": "Configuration date",
     "CONFIGURATION_TIME": "Configuration time", "CONTROLWORD": "Controlword",
-    "CURRENT_PERMILLE": "Current actual value", "DEVICE_TYPE": "Device type",
+    "CURRENT_PERMILLE": "Current actual value", "DC_LINK_MV": "DC link circuit voltage", "DEVICE_TYPE": "Device type",
     "ENCODER_INCREMENTS": "Encoder increments", "ERROR_CODE": "Error code", "ERROR_REGISTER": "Error register",
     "EXCITATION_COMMAND": "Command", "EXCITATION_FIELDS.abort_current_apk": "Abort current",
     "EXCITATION_FIELDS.abort_speed_rad_s": "Abort speed, electrical", "EXCITATION_FIELDS.amplitude": "Amplitude",
@@ -119,7 +119,7 @@ OF_THE_STANDARD = {
     motion_objects.POSITION_UNIT: (0x60A8, 0, "I"), motion_objects.TORQUE_SLOPE: (0x6087, 0, "I"),
     motion_objects.PERIOD_VALUE: (0x60C2, 1, "B"), motion_objects.PERIOD_EXPONENT: (0x60C2, 2, "b"),
     set_point.TARGET_POSITION: (0x607A, 0, "i"), set_point.POSITION_DEMAND: (0x6062, 0, "i"),
-    standard_drive.COMMUTATION_ANGLE: (0x60EA, 0, "H"), torque_drives.DC_LINK_MV: (0x6079, 0, "I"),
+    standard_drive.COMMUTATION_ANGLE: (0x60EA, 0, "H"), objects.DC_LINK_MV: (0x6079, 0, "I"),
 }  # fmt: skip
 
 

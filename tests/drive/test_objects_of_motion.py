@@ -13,9 +13,9 @@ from pmsmtool.drive import dead_man, objects
 from pmsmtool.drive.canopen_drive import _buffer_periods
 from pmsmtool.drive.guard import GuardedDrive
 from pmsmtool.drive.motion_objects import PERIOD_EXPONENT, PERIOD_VALUE, TORQUE_SLOPE, cyclic_period_s, slow_slope_s
-from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.objects import DC_LINK_MV, DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Shape
-from pmsmtool.drive.torque_drives import DC_LINK_MV, TorqueDrive
+from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.errors import NotAvailable, SdoAbort
 
 
