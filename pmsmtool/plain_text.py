@@ -34,6 +34,14 @@ def counted(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
+def by_reason(reasons: Iterable[tuple[str, str]], between: str = ": ") -> list[str]:
+    """Return one line per reason, with all the names (first of each pair) that it is given for."""
+    named: dict[str, list[str]] = {}
+    for name, why in reasons:
+        named.setdefault(why, []).append(name)
+    return [f"{', '.join(names)}{between}{why}" for why, names in named.items()]
+
+
 def one_line(text: str, longest: int | None = None) -> str:
     """Return a text as :func:`plain` does, on one line, and cut to ``longest`` letters."""
     if longest is not None and len(text) > longest:

@@ -136,6 +136,8 @@ def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bo
 
 def _lines(found: Capabilities, denied: Mapping[str, str], sources: bool) -> list[str]:
     """Return what a person reads: what is had, then what is missing and for what, then what is written."""
+    from pmsmtool.plain_text import by_reason
+
     identity = found.identity
     lines = [
         f"node {identity.node}  {identity.name}  vendor {identity.vendor:#010x}  product {identity.product:#x}  "
@@ -153,11 +155,9 @@ def _lines(found: Capabilities, denied: Mapping[str, str], sources: bool) -> lis
     )
     by_hand = ", ".join(row.quantity for row in rows if row.method == "manual")
     lines += [f"as given, in a motor file (`pmsmtool machine new`): {by_hand}", ""]
-    lacking: dict[str, list[str]] = {}
-    for row in rows:
-        if not row.available and not row.waits_for_person:
-            lacking.setdefault(f"by {row.method.value}: needs {', '.join(row.missing)}", []).append(row.quantity)
-    lines += [f"not available: {', '.join(quantities)} {why}" for why, quantities in lacking.items()]
+    lacking = [row for row in rows if not row.available and not row.waits_for_person]
+    reasons = ((row.quantity, f"by {row.method.value}: needs {', '.join(row.missing)}") for row in lacking)
+    lines += [f"not available: {line}" for line in by_reason(reasons, " ")]
     return lines if found.drive_map.staging else [*lines, *_parameter_lines(found, denied, sources)]
 
 

@@ -300,6 +300,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison |
     from pmsmtool.cli.output import table
     from pmsmtool.errors import IdentificationError, Partial
     from pmsmtool.identification.request import accuracy_line, accuracy_told
+    from pmsmtool.plain_text import by_reason
     from pmsmtool.report.report import total_interval
     from pmsmtool.report.verdict import on_which_drive
     from pmsmtool.units import format_estimate, format_quantity
@@ -349,7 +350,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison |
         )
     if stage.status == "pass":
         return
-    refused = [f"{name}: {reason}" for name, reason in stage.refused.items()]
+    refused = by_reason(stage.refused.items())
     if stage.status == "partial":
         where = "machine.toml" if any(name.endswith("machine.toml") for name in stage.files) else "run.json"
         if not stage.refused:

@@ -38,6 +38,7 @@ from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.capabilities import Capabilities, reference_capabilities
 from pmsmtool.measurement.run_account import RunAccount, begin_run, status_of, text_of
+from pmsmtool.plain_text import by_reason
 from pmsmtool.proof.stage import ProofRequest, not_proven
 from pmsmtool.report.verdict import RAN
 from pmsmtool.run_directory import RunDirectory, RunRecord, Stage
@@ -344,7 +345,7 @@ def _not_good(stage: Stage, run: RunDirectory) -> PmsmtoolError:
     if (contradicted := refusal(stage, run)) is not None:
         return contradicted
     if stage.name == "identify":
-        what = "; ".join(f"{name}: {reason}" for name, reason in stage.refused.items()) or what
+        what = "; ".join(by_reason(stage.refused.items())) or what
         return IdentificationError("E_NOT_ACCEPTED", what, where=where, hint=NOT_ACCEPTED)
     if stage.name == "verify":
         return VerifyMismatch(what, where=where, hint="flash again: commission --resume " + where)

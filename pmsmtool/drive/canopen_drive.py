@@ -23,6 +23,8 @@ from pmsmtool.units import RAD_S_PER_MRPM
 
 PERIOD = "inverter.T_s_ns"
 """The reference drive counts speed in thousandths of a mechanical revolution per minute."""
+MODE_S, MODE_LOOK_S = 0.5, 0.005
+"""Longest time until a drive shows the mode that it took, and the time between two looks."""
 HELD_S = 0.2
 """The position loop holds the shaft this long before a move that is recorded."""
 
@@ -167,7 +169,14 @@ class CanopenDrive:
         self._set_mode(Mode.PROFILE_VELOCITY)
 
     def _set_mode(self, mode: int) -> None:
-        if self.node.whole(objects.MODE_DISPLAY) == mode:
+        """Ask for a mode of operation, and go on when the drive shows it (0x6061), or shows none at all.
+
+        Raises
+        ------
+        NotAvailable
+            The drive refuses the mode, or stays in another one.
+        """
+        if self._shown_mode() == mode:
             return
         try:
             self.node.put(objects.MODE, mode)
@@ -177,6 +186,24 @@ class CanopenDrive:
                 where=f"node {self.node.node}, 0x6060:00",
                 hint="`pmsmtool caps` lists what this drive can measure",
             ) from abort
+        clock = self.node.connection.clock
+        end = clock.now() + MODE_S
+        while (shown := self._shown_mode()) not in (None, mode):
+            if clock.now() >= end:
+                raise NotAvailable(
+                    f"the drive stays in mode of operation{_mode_name(shown)} ({shown}), though{_mode_name(mode)} "
+                    f"({int(mode)}) was asked for and taken", where=f"node {self.node.node}, 0x6061:00",
+                    likely="the mode needs an option of the drive, or another source of commands is set in it",
+                    hint="choose the source and the mode with the maker's tool; `pmsmtool caps` lists what this drive "
+                    "can measure",
+                )  # fmt: skip
+            self.node.connection.wait(MODE_LOOK_S)
+
+    def _shown_mode(self) -> int | None:
+        try:
+            return self.node.whole(objects.MODE_DISPLAY)
+        except SdoAbort:  # an object that the standard asks for; whoever lacks it is taken at its word
+            return None
 
     # ---- measurements ---------------------------------------------------------------------------
 

@@ -37,6 +37,7 @@ from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.identification.request import Method
 from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.plain_text import by_reason
 
 T = TypeVar("T")
 
@@ -276,17 +277,20 @@ class Capabilities:
         )
 
     def _reasons(self, quantities: Sequence[str], method: Method | None) -> list[str]:
-        lines = []
+        """Return one line per reason, with the quantities that it stands in the way of."""
+        lines: list[tuple[str, str]] = []
         for quantity in quantities:
             rows = [self.row(quantity, m) for m in (WAYS[quantity] if method is None else (method,))]
             if any(row.available and row.method in MEASURING for row in rows):
-                lines.append(f"{quantity}: by itself yes ({self._how(quantity, method)}), together with the others no")
+                lines.append(
+                    (quantity, f": by itself yes ({self._how(quantity, method)}), together with the others no")
+                )
                 continue
             for row in rows:
                 if row.method in MEASURING or method is not None:
                     needs = f"not available: needs {', '.join(row.missing)}" if row.missing else "a number you bring"
-                    lines.append(f"{quantity} by {row.method}: {needs}")
-        return lines
+                    lines.append((quantity, f" by {row.method}: {needs}"))
+        return by_reason(lines, "")
 
     def _how(self, quantity: str, method: Method | None) -> str:
         best = self.best(quantity)

@@ -177,7 +177,7 @@ def test_caps_of_an_unknown_drive_says_so() -> None:
     ("options", "arguments", "said"),
     [
         ("&drive=epos4", ("R",), "R by inject: not available: needs current set-points for d and q"),
-        ("&drive=epos2", (), "encoder by standard: not available: needs"),
+        ("&drive=epos2", (), "encoder, poles by standard: not available: needs"),
         ("&drive=cia402", ("L",), "L by recorder: not available: needs a recorder of currents and voltages"),
         ("&drive=epos2", ("mechanics",), "mechanics by standard: not available: needs torque mode"),
         ("&level=recorder", ("encoder",), "encoder by inject: not available: needs"),
@@ -195,6 +195,8 @@ def test_identify_ends_in_exit_9_and_names_what_is_missing(
     error = outcome.exception
     assert isinstance(error, NotAvailable) and error.exit_code == 9
     assert said in str(error)
+    reasons = [line.partition(" by ")[2] for line in str(error).splitlines() if " by " in line]
+    assert len(reasons) == len(set(reasons)), "one line per reason, however many quantities it is given for"
     assert not (tmp_path / "runs").exists()  # nothing was begun
 
 

@@ -244,6 +244,42 @@ def test_the_mode_is_the_live_drives(tmp_path: Path, modes: int, mode: int) -> N
         assert rig.drive.target.mode == mode
 
 
+@pytest.mark.parametrize(("late_s", "shown"), [(math.inf, 3), (math.inf, 0), (0.2, 3)])
+def test_a_drive_that_stays_in_another_mode_is_refused_before_it_is_energised(
+    tmp_path: Path, late_s: float, shown: int
+) -> None:
+    """0x6060 is taken, 0x6061 stays: its velocity loop would have taken the torque's zero for a speed."""
+    with opened(tmp_path, epos4()) as rig:
+        clock, mode = rig.drive.node.connection.clock, rig.session.dictionary.find(0x6060, 0)
+        taken, written = [0.0], mode.sink
+        assert written is not None
+
+        def take(data: bytes) -> None:
+            taken[0] = clock.now()
+            written(data)
+
+        mode.sink = take
+        rig.session.dictionary.find(0x6061, 0).source = lambda: (
+            mode.value if clock.now() - taken[0] >= late_s else bytes((shown,))
+        )
+        if late_s < 1.0:
+            with guarded(rig.drive, ENVELOPE) as guard:
+                guard.enable()
+            return
+        stays = pytest.raises(NotAvailable, match=rf"stays in mode .*\({shown}\), though cyclic torque \(10\)")
+        with stays, guarded(rig.drive, ENVELOPE) as guard:
+            guard.enable()
+        assert not rig.was_on
+
+
+def test_a_drive_that_shows_no_mode_is_taken_at_its_word(tmp_path: Path) -> None:
+    with opened(tmp_path, epos4()) as rig:
+        rig.session.dictionary.hide(0x6061)
+        with guarded(rig.drive, ENVELOPE) as guard:
+            guard.enable()
+        assert rig.was_on
+
+
 SLOPE: tuple[Row, ...] = ((0x6087, 0, "U32", "rw", "100"),)
 """10 % of the rated torque per second: as one maker's drive is stored."""
 
