@@ -85,6 +85,7 @@ def near_names(path: Path) -> str:
     except (OSError, ValueError):
         return ""
     typed = Path(path).name
+    names = [name for name in names if name != typed]  # a device, or one that may not be read: it is there
     near = [name for name in names if Path(name).stem == typed] or get_close_matches(typed, names, 2)
     return f"did you mean {' or '.join(str(Path(path).with_name(name)) for name in near)}?" if near else ""
 

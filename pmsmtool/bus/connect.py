@@ -135,7 +135,7 @@ def _open_failure(arguments: Mapping[str, Any], error: Exception) -> PmsmtoolErr
         f"the bus does not open: {reason(error)}",
         where=where,
         likely=_why_closed(name, error),
-        hint=how_to_set_up(name or "") or "`pmsmtool doctor`",
+        hint=how_to_set_up(name or "") or "`pmsmtool doctor` without -i lists what each adapter needs here",
     )
 
 

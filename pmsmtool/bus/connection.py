@@ -305,7 +305,8 @@ class Connection:
                 f"`pmsmtool info -n {node}`, or reset the node",
             )
         if others:
-            return f"only others were heard, node {', '.join(map(str, others))}: wrong node id?", "`pmsmtool scan`"
+            heard = ", ".join(map(str, others))
+            return f"only others were heard, node {heard}: wrong node id?", "`pmsmtool scan` without -n"
         if self.error_frames:
             return "only error frames were heard: wrong bit rate, or a bus without termination", "`pmsmtool doctor`"
         return (

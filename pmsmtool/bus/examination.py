@@ -7,7 +7,7 @@ import contextlib
 import importlib
 import logging
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -143,6 +143,13 @@ def find_bitrate(
         except PmsmtoolError:
             continue  # the adapter does not have this rate
     return found
+
+
+def no_rate(rates: Mapping[int, tuple[int, int]]) -> str:
+    """Return why no bit rate was heard without errors, of the counts of :func:`find_bitrate`."""
+    if rates and all(errors and not frames for frames, errors in rates.values()):
+        return f"only error frames, at every bit rate: {TERMINATION}; or CAN_H and CAN_L are swapped"
+    return "no bit rate was heard: switch a node on while this listens, it sends when it starts; or swapped wires"
 
 
 class _Bits:

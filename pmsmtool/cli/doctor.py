@@ -59,7 +59,7 @@ def doctor_command(bus: BusOptions, out: Output, find_bitrate: bool, listen_s: f
         rate = "`pmsmtool doctor --find-bitrate` listens at every usual bit rate"
         raise BusError(
             failed, where=" ".join(str(v) for v in (bus.interface, bus.channel) if v),
-            hint=rate if "bit rate" in failed else "see the lines above",
+            hint=rate if "bit rate" in failed and not find_bitrate else "see the lines above",
         )  # fmt: skip
 
 
@@ -79,10 +79,8 @@ def _examined(bus: BusOptions, find_bitrate: bool, listen_s: float) -> tuple[dic
         heard = [rate for rate, (n, e) in rates.items() if n and not e]
         lines += [f"PASS  the bus runs at {rate} bit/s: give -b {rate}" for rate in heard]
         if not heard:
-            lines.append(
-                "no bit rate was heard without errors: switch a node on, it sends when it starts; "
-                "then look at the termination (60 ohm between CAN_H and CAN_L) and for swapped wires"
-            )
+            failed = examination.no_rate(rates)
+            lines.append(f"FAIL  {failed}")
     elif configured.get("interface") is not None:
         with bus.connect() as connection:
             bitrate = bus.bitrate or _number(configured.get("bitrate"))

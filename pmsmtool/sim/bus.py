@@ -121,7 +121,8 @@ class PmsmSimBus(can.BusABC):
         self.channel_info = f"pmsmsim channel {self._key or 'default'}"
         self._speed = parsed.speed
         self._arrived = threading.Condition(self.clock.lock)
-        self._deaf = None not in (bitrate, self.line.bitrate) and int(bitrate or 0) != self.line.bitrate
+        other_rate = None not in (bitrate, self.line.bitrate) and int(bitrate or 0) != self.line.bitrate
+        self._deaf = other_rate or parsed.terminator == "missing"
         self._open = True
         with self.clock.held:
             self.line.attach(self)

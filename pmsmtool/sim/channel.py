@@ -18,6 +18,7 @@ NAME is a profile (``pmsmtool sim list``) or the path of a machine file. Keys:
            excitation, too; ``tier`` is the older name of this key
 ``filter`` time constant (s) of a set-point filter behind the torque slope; default: none
 ``jitter`` how late (s) a process data object is sent at most; default: not late
+``terminator`` ``missing``: every frame of the line is damaged, at any bit rate
 ``speed``  how fast idle time passes at most, as a multiple of the wall clock; default: at once
 ========== =============================================================================================
 
@@ -66,6 +67,7 @@ DEFAULT_NODE_ID = 1
 LARGEST_NODE_ID = 127
 MEMORY_FOLDER = Path(".pmsmsim")
 VOLATILE = ":memory:"
+TERMINATORS = ("fitted", "missing")
 _RATES = range(10_000, 1_000_001)
 
 
@@ -87,6 +89,7 @@ class Channel:
     level: str | None = None
     filter: float = 0.0
     jitter: float = 0.0
+    terminator: str = "fitted"
     simulation: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -120,6 +123,12 @@ def _level(text: str) -> str:
     return text
 
 
+def _terminator(text: str) -> str:
+    if text not in TERMINATORS:
+        raise ValueError(f"must be one of {', '.join(TERMINATORS)}")
+    return text
+
+
 _KEYS: dict[str, Callable[[str], Any]] = {
     "seed": _whole(0, 2**63 - 1),
     "nv": str,
@@ -134,6 +143,7 @@ _KEYS: dict[str, Callable[[str], Any]] = {
     "level": _level,
     "filter": _short_time,
     "jitter": _short_time,
+    "terminator": _terminator,
 }
 
 

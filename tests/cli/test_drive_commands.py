@@ -14,6 +14,7 @@ from typing import Any
 import can
 import pytest
 
+from pmsmtool.bus.examination import no_rate
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.cli.main import run
 from pmsmtool.drive.drive_node import DriveNode
@@ -126,6 +127,23 @@ def test_doctor_finds_the_bit_rate(tool: Tool) -> None:
     assert good == ["250000"]
     _, out, _ = tool("doctor", "--find-bitrate", channel="interior-2k2?nv=:memory:&bitrate=250000")
     assert out.splitlines()[-1] == "PASS  the bus runs at 250000 bit/s: give -b 250000" and "FAIL" not in out
+
+
+def test_doctor_names_a_missing_terminator(tool: Tool) -> None:
+    """A bus that damages every frame at every bit rate: before, it could not be simulated and the search ended by 0."""
+    bare = "interior-2k2?nv=:memory:&terminator=missing"
+    code, out, err = tool("doctor", "--find-bitrate", channel=bare)
+    assert code == 3 and "only error frames, at every bit rate: termination" in out
+    assert "120 ohm is one missing resistor" in out and "--find-bitrate" not in err
+    code, _, err = tool("info", channel=bare)
+    assert code == 3 and "a bus without termination" in err
+    code, _, err = tool("info", channel="interior-2k2?terminator=mising")
+    assert code == 2 and "must be one of fitted, missing" in err
+
+
+def test_silence_at_every_rate_is_no_missing_terminator() -> None:
+    assert "switch a node on" in no_rate({500_000: (0, 0), 250_000: (0, 3)}) and "switch a node on" in no_rate({})
+    assert no_rate({500_000: (0, 2), 250_000: (0, 3)}).startswith("only error frames")
 
 
 # ---- parameters -------------------------------------------------------------------------------------------
