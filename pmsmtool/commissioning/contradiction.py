@@ -309,11 +309,14 @@ def _judged(row: Row, file: MachineFile, found: Mapping[str, _Measured], *, used
 
 
 def _of_another_motor(rows: Sequence[Row], file: MachineFile, *, loaded: bool) -> bool:
-    """Whether most of what the drive holds would contradict values of the file that the measurement confirms."""
+    """Whether half of what the drive holds, or more, would contradict values of the file that the measurement confirms.
+
+    Half: pole pairs of two motors are often alike.
+    """
     confirmed = [row for row in rows if row.verdict == "agrees" and None not in (row.measured, row.held)]
     held = [replace(row, measured=None) for row in confirmed if row.name in HELD and not row.factory]
     other = [_judged(row, file, {}, used=True, loaded=loaded).verdict == "contradicts" for row in held]
-    return sum(other) > 0.5 * len(other)
+    return bool(other) and sum(other) >= 0.5 * len(other)
 
 
 def _exact(row: Row, *, used: bool) -> Row:

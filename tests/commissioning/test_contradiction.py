@@ -217,6 +217,9 @@ def test_a_memory_of_another_motor_checks_nothing_of_what_was_refused() -> None:
         left = [row for row in rows if row.name in refused]
         assert not wrong(rows) and {row.verdict for row in left} == {"NOT CHECKED"}
         assert all(OTHER_MOTOR in row.text for row in left if row.held is not None)
+    # two motors may have as many pole pairs
+    alike = [v for v in measured() if v["name"] in ("pole_pairs", "psi_f_wb")]
+    assert not wrong(compare(TRUTH, {**other, "pole_pairs": TRUTH.machine.pole_pairs}, alike))
     # one value that differs is a wrong file, or one wrong value in the drive: the others still are this motor's
     one = {**{key: getattr(TRUTH.machine, key) for key in HELD}, "L_d_h": 1e-4}
     assert wrong(compare(stated(R_s_ohm=2.0), one, [v for v in measured() if v["name"] != "R_s_ohm"])) == ["R_s_ohm"]
