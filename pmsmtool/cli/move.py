@@ -135,6 +135,8 @@ def move_command(
             trace = record_move(guard, drive, way_rad, settle_s, times)
             seconds = connection.clock.now() - began
         drive.close()
+    if drive.ramp_lent != 1.0:
+        out.warn(f"the drive's own ramp (0x6083) is slow: {drive.ramp_lent:.3g} times it was lent for this move")
     run.save(TRACE, trace_npz(trace))
     found = move_result(trace)
     values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]

@@ -7,6 +7,7 @@ any delay of the bus. The position loop is the drive's own: every stop removes t
 
 from __future__ import annotations
 
+import contextlib
 import math
 from contextlib import AbstractContextManager
 
@@ -26,7 +27,8 @@ from pmsmtool.errors import LimitExceeded, NotAvailable, SdoAbort
 from pmsmtool.trace import Trace
 
 SHOWN = ("position", "demand", "current")
-
+RAMPS = (objects.PROFILE_ACCELERATION, objects.PROFILE_DECELERATION)
+LARGEST = 0xFFFF_FFFF
 
 FOLLOWS_S, FOLLOWS_SHARE = 0.05, 0.01
 """A shaft is on its way where in that time it has come nearer by that share of the limit. As their makers' tools leave
@@ -45,6 +47,8 @@ class PositionDrive(TorqueDrive):
         times that, in any case.
     current_allowed_apk : float
         Rated current, or the drive's own limit where that is smaller (A peak).
+    ramp_lent : float
+        Factor by which the drive's ramps are faster than stored.
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
 
@@ -72,6 +76,7 @@ class PositionDrive(TorqueDrive):
                 hint="`pmsmtool caps` lists what this drive can measure",
             )  # fmt: skip
         self.error_limit_rad = math.inf
+        self.ramp_lent = 1.0
         kept = allowed(self.node, current_limits(self.node, self._rated_apk))
         self.current_allowed_apk = self._rated_apk if kept is None else min(self._rated_apk, kept[1])
         self.sends = True
@@ -105,6 +110,19 @@ class PositionDrive(TorqueDrive):
         """
         counts = self._start_counts + angle_rad / (2.0 * math.pi) * self.counts_per_turn
         start_move(self.node, counts)
+
+    def profile(self) -> str:
+        """Return what the drive's own profile holds, in its units."""
+        held = ((item, self.node.held(item)) for item in (objects.PROFILE_VELOCITY, *RAMPS))
+        return ", ".join(f"0x{item.index:04X} = {value:.0f}" for item, value in held if value is not None)
+
+    def lend_ramp(self, factor: float) -> None:
+        """Make the drive's ramps faster by a factor, whatever their unit; the guard brings the old ones back."""
+        self.ramp_lent = factor
+        with contextlib.suppress(SdoAbort):  # a drive that refuses goes on as slowly
+            for item in RAMPS:
+                if (counts := self.node.held(item)) is not None:
+                    self.node.put(item, min(LARGEST, round(counts * factor)))
 
     def demanded_rad(self) -> float:
         """Return the demand as the drive shows it now, from where the shaft stood when it was enabled."""

@@ -268,3 +268,20 @@ def test_a_refused_mode_stands_in_no_chains_way(tool: Tool) -> None:
     assert code == 10 and "E_NOT_ACCEPTED" not in said + out, said
     (record,) = Path("runs").glob("*/run.json")
     assert "(11), which 0x6502 announces" in record.read_text(encoding="utf-8")
+
+
+@pytest.mark.chain
+def test_a_ramp_that_was_never_set_up_is_lent_a_faster_one(tool: Tool) -> None:
+    """0x6083 = 1 count of unknown unit: the demand had made 0.01 rad of 90 degrees when the move was given up."""
+    loop: tuple[Row, ...] = (
+        (0x6062, 0, "I32", "ro", ""), (0x607A, 0, "I32", "rw", "0"), (0x6081, 0, "U32", "rw", "16384"),
+        (0x6083, 0, "U32", "rw", "1"), (0x6084, 0, "U32", "rw", "1"),
+    )  # fmt: skip
+    write_eds(Path("x.eds"), unknown("0x2D", *loop))
+    channel = "interior-2k2?nv=:memory:&eds=x.eds"
+    code, out, said = tool("--sim", channel, "--yes", "move", "--by", "90deg", "--speed-max", "500rpm", "--json")
+    assert code == 0 and "the drive's own ramp (0x6083) is slow" in said, said
+    assert json.loads(out)["move"]["moving_s"] < 8.0, "two moves with half of the way in a second"
+    write_eds(Path("y.eds"), unknown("0x2D", *(row for row in loop if row[0] not in (0x6083, 0x6084))))
+    code, _, said = tool("--sim", channel.replace("x.eds", "y.eds"), "--yes", "move", "--by", "20deg", "--json")
+    assert "0x6083" not in said
