@@ -166,7 +166,8 @@ class RunDirectory:
         path = self.path / RECORD
         hint = "give a directory that identify or commission made"
         if not path.exists():
-            raise ConfigError(f"no {RECORD} here", where=str(self.path), hint=hint)
+            what = f"no {RECORD} here" if self.path.exists() else "no such folder"
+            raise ConfigError(what, where=str(self.path), hint=hint)
         text = read_text(path, largest=ROWS_BYTES, hint=hint)
         try:
             raw = json.loads(text)

@@ -127,6 +127,7 @@ def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bo
     lines = [f"written: {drive_map.row_text(name)}" for name in written] if sources else table(("", "", ""), rows)[1:]
     return [
         "",
+        "of a set, `flash-params` writes what is listed here as written; nothing is written now",
         *lines,
         *(f"not written: {drive_map.row_text(name)}: {why}" for name, why in unwritten.items()),
         *(f"not written: {name}: {why}" for name, why in drive_map.left_out.items() if name in BY_NAME),

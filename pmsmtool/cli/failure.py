@@ -117,7 +117,7 @@ def _tell_usage(error: click.ClickException) -> int:
         near = [o for o in error.possibilities if get_close_matches(error.option_name.strip("-"), [o.strip("-")])]
         error = click.NoSuchOption(error.option_name, possibilities=near, ctx=error.ctx)
     place = f"{error.ctx.command_path} --help" if isinstance(error, click.UsageError) and error.ctx else ""
-    message = error.format_message().strip()
+    message = error.format_message().strip().replace("a valid integer range", "a whole number")
     _tell(ConfigError(message[:1].lower() + message[1:].rstrip("."), hint=place))
     return int(ExitCode.USAGE)
 

@@ -50,10 +50,11 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
     text = [f"{equal} of {len(plan.entries)} objects match (values only; run prove to test behaviour)"]
     out.result("verify", {"identity": identity, "ok": not plan.changes, **plan_facts(plan)}, text)
     if plan.changes:
+        chosen = "" if map_file is None else f" --map {map_file}"
         command = f"restore{' --other-drive' if other_drive else ''}" if backup else "flash-params"
         raise VerifyMismatch(
             f"{len(plan.changes)} of {len(plan.entries)} objects hold something else; listed: drive -> {source.name}",
             where=f"node {identity.node}",
             differences=plan.lines()[: len(plan.changes)],
-            hint=f"`pmsmtool {command} {source}` brings them to the drive",
+            hint=f"`pmsmtool {command} {source}{chosen}` brings them to the drive",
         )

@@ -11,6 +11,7 @@ from typing import Any
 from pmsmtool.commissioning.export import image_of
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.firmware.image import crc32
 from pmsmtool.flash.download import Download, set_named
 from pmsmtool.flash.journal import JournalFolder
@@ -52,6 +53,7 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
                     *firmware,
                     *plan.lines(_unchecked_marks(run, [change.name for change in plan.changes])),
                     *plan.after_lines(store=True),
+                    f"undo      `pmsmtool restore{_map_option(drive.node.map)}` brings the old values back",
                 ]
             )
         outcome = download.run()
@@ -67,6 +69,11 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
         note="" if good else "the drive does not keep the set", fallbacks=(*plan.left_out(), *firmware),
         summary=f"{outcome.written} of {total} objects written, stored, read back after a reset",
     )  # fmt: skip
+
+
+def _map_option(drive_map: DriveMap) -> str:
+    """Return the option that names the map of a drive which is not the reference drive."""
+    return "" if drive_map.name == reference_map().name else f" --map {drive_map.name}"
 
 
 def _held_already(plan: Plan, firmware: Sequence[str]) -> Stage:

@@ -217,8 +217,10 @@ def _beyond(design: Design, conditions: Conditions) -> list[str]:
         ("current", conditions.i_max_apk, design["motor.I_nom_apk"], "A pk"),
         ("speed", conditions.speed_max_rad_s / RPM, rated_rpm, "rpm"),
     )
+    supply_w = design.machine.conditions.get(SUPPLY)
+    limit = f": the DC link gives way at {supply_w:.3g} W" if isinstance(supply_w, float) else ""
     lines = [
-        f"{name} beyond {allowed:.4g} of rated {rated:.4g} {unit} (the envelope of the proof): NOT CHECKED"
+        f"{name} beyond {allowed:.4g} of rated {rated:.4g} {unit} (the envelope of the proof{limit}): NOT CHECKED"
         for name, allowed, rated, unit in rows
         if allowed < rated * (1.0 - ROUNDING)
     ]

@@ -258,6 +258,7 @@ def test_a_map_without_a_co_energy_is_used_but_not_silently(
          "has no unit"),
         ("machine new --name m --pole-pairs 4 --r -0.3ohm --l 4mH --kt 1Nm/Arms --u-dc 540V --pwm 12kHz -o new.toml",
          "R_s_ohm"),
+        ("machine new --pole-pairs 1e30", "'1e30' is not a whole number"),
     ],
 )  # fmt: skip
 def test_arguments(command: str, says: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

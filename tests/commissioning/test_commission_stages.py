@@ -18,10 +18,12 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.commissioning import commission, level_stages
 from pmsmtool.commissioning.commission import STAGES, Commissioning, begin_run, due_stages
 from pmsmtool.commissioning.export import image_of
+from pmsmtool.commissioning.flash_stages import _map_option
 from pmsmtool.design.loops.margins import MarginRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import (
     CheckFailed,
     ConfigError,
@@ -355,3 +357,5 @@ def test_differences_that_follow_from_unchecked_values_say_so(tmp_path: Path, dr
     marked = {line.split()[0] for line in person.shown[0] if line.endswith("from R: NOT CHECKED")}
     assert {"motor.R_s_ohm", "current.K_i_d_v_per_as", "current.K_i_q_v_per_as"} <= marked
     assert "current.K_p_d_v_per_a" not in marked
+    assert person.shown[0][-1] == "undo      `pmsmtool restore` brings the old values back"
+    assert _map_option(load_family("epos4")) == " --map epos4"

@@ -40,7 +40,7 @@ from pmsmtool.proof import measured
 from pmsmtool.proof import stage as stages
 from pmsmtool.proof.judgement import judge, with_ripple
 from pmsmtool.proof.plan import Conditions
-from pmsmtool.proof.stage import ProofRequest, _too_slow, envelope_of, prove_stage, read_proof, responses
+from pmsmtool.proof.stage import ProofRequest, _beyond, _too_slow, envelope_of, prove_stage, read_proof, responses
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RECORD, RunDirectory, Stage
 from pmsmtool.sim.kernel import Params
@@ -253,6 +253,9 @@ def test_a_supply_that_gives_way_bounds_the_power_of_a_proof(design: Design) -> 
     assert weak.i_max_apk >= LEAST_CURRENT * usual.i_max_apk
     asked = ProofRequest(i_max_apk=1.0, speed_max_rad_s=50.0)
     assert envelope_of(replace(design, machine=machine), asked) == envelope_of(design, asked)
+    below = Conditions(540.0, 25.0, 25.0, 1 << 17, 2.4, 18.7)
+    assert all("the envelope of the proof: the DC" in line for line in _beyond(replace(design, machine=machine), below))
+    assert [line for line in _beyond(design, below) if line.endswith("(the envelope of the proof): NOT CHECKED")]
 
 
 def test_the_link_is_known_beside_its_ripple(design: Design) -> None:
