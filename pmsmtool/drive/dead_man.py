@@ -76,6 +76,40 @@ class DeadManProof:
         )
 
 
+@dataclass(slots=True)
+class _Late:
+    """What kept a try from measuring.
+
+    Attributes
+    ----------
+    own_s : float
+        By how much this computer woke later than it wanted to, at most (s).
+    answer_s : float
+        Longest time between a question and its answer (s).
+    """
+
+    own_s: float = 0.0
+    answer_s: float = 0.0
+
+    def note(self, wanted_s: float, began_s: float, asked_s: float, answered_s: float) -> None:
+        """Take a pause that should have taken a time (s), and the question behind it: began, asked, answered (s)."""
+        self.own_s = max(self.own_s, asked_s - began_s - wanted_s)
+        self.answer_s = max(self.answer_s, answered_s - asked_s)
+
+    def refusal(self, node: int) -> SafetyRefusal:
+        """Return what ends the proof: the computer where it was late by itself, else the answers."""
+        busy = self.own_s > ROUND_S
+        return SafetyRefusal(
+            f"the supervision could not be tested in {TRIES} tries: an answer took up to {1e3 * self.answer_s:.0f} ms, "
+            f"and this computer was up to {1e3 * self.own_s:.0f} ms late by itself",
+            where=f"node {node}",
+            likely="other programs keep the tool from running, so its heartbeat stays away" if busy
+            else "the drive, the adapter or the bus is slow: this computer is not",
+            hint=f"{'end them' if busy else 'use another adapter or a faster bit rate, end other traffic'}, then run "
+            "the command again; nothing was moved",
+        )  # fmt: skip
+
+
 def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
     """Show that the drive leaves operation when the heartbeat stops; it is disabled on return.
 
@@ -87,7 +121,7 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
     Raises
     ------
     SafetyRefusal
-        The drive has no supervision, ignores it, or reacts too late; or the computer is too busy to show it.
+        The drive has no supervision, ignores it, or reacts too late; or computer or answers are too late to show it.
     """
     node = drive.node
     if not (_set_consumer(drive) or _set_guarding(drive, heartbeat) or _set_process_data(drive, heartbeat)):
@@ -99,9 +133,10 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
     quick_stop = set_quick_stop(node, QuickStop.DISABLE)
     if abort_option in (None, AbortConnection.FAULT):
         _fault_without_ramp(node)
+    late = _Late()
     with node.emergencies_tolerated():
         for _ in range(TRIES):
-            proof = _try(drive, heartbeat, abort_option, quick_stop)
+            proof = _try(drive, heartbeat, abort_option, quick_stop, late)
             heartbeat.start()
             if node.state() in (State.FAULT, State.FAULT_REACTION_ACTIVE):
                 node.wait_for_state(lambda state: state is State.FAULT)
@@ -109,36 +144,42 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
             drive.disable()
             if proof is not None:
                 return proof
-    raise SafetyRefusal(
-        f"the supervision could not be tested in {TRIES} tries: this computer was too busy to measure it",
-        where=f"node {node.node}",
-        likely="other programs keep the tool from running, so its heartbeat stays away",
-        hint="end them, then run the command again; nothing was moved",
-    )
+    raise late.refusal(node.node)
 
 
 def _try(
-    drive: CanopenDrive, heartbeat: Heartbeat, abort_option: AbortConnection | None, quick_stop: int | None
+    drive: CanopenDrive,
+    heartbeat: Heartbeat,
+    abort_option: AbortConnection | None,
+    quick_stop: int | None,
+    late: _Late,
 ) -> DeadManProof | None:
-    """Enable, stop the heartbeat and measure; None where this computer stalled, so that nothing is shown."""
-    node = drive.node
+    """Enable, stop the heartbeat and measure; None where computer or answers stalled, so that nothing is shown."""
+    node, clock = drive.node, drive.node.connection.clock
     heartbeat.start()
     drive.enable()
     for _ in range(round(2e-3 * CONSUMER_MS / PERIOD_S)):  # asked meanwhile: the heartbeat is sent while it is watched
+        began = clock.now()
         node.connection.wait(PERIOD_S)
+        asked = clock.now()
         state = node.state()
+        late.note(PERIOD_S, began, asked, clock.now())
     if state is not State.OPERATION_ENABLED:
-        late = heartbeat.longest_gap_s() > LATE_S
+        stayed_away = heartbeat.longest_gap_s() > LATE_S
         heartbeat.stop()
         drive.quick_stop()
-        if late:
+        if stayed_away:
             return None
         raise _refused("the drive leaves operation although the tool's heartbeat runs", drive)
-    return _stop_and_measure(drive, heartbeat, abort_option, quick_stop)
+    return _stop_and_measure(drive, heartbeat, abort_option, quick_stop, late)
 
 
 def _stop_and_measure(
-    drive: CanopenDrive, heartbeat: Heartbeat, abort_option: AbortConnection | None, quick_stop: int | None
+    drive: CanopenDrive,
+    heartbeat: Heartbeat,
+    abort_option: AbortConnection | None,
+    quick_stop: int | None,
+    late: _Late,
 ) -> DeadManProof | None:
     clock = drive.node.connection.clock
     stopped = clock.now()
@@ -154,6 +195,7 @@ def _stop_and_measure(
         state = drive.node.state()
         passed = clock.now() - stopped
         stalled += max(0.0, passed - before - ROUND_S)
+        late.note(_POLL_S if before else asked, before, asked, passed)
         off = is_safe(state)
         if state is not None and off and passed <= declared:
             return DeadManProof(declared, passed, abort_option, quick_stop, state, heartbeat.kind)

@@ -118,11 +118,33 @@ def test_a_measurement_in_which_the_computer_stalled_is_repeated(
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
 
 
-def test_a_computer_that_always_stalls_shows_no_dead_man(bench: SimBench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_late_answers_show_no_dead_man_and_are_not_told_as_a_busy_computer(
+    bench: SimBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen = stalling(bench, monkeypatch, 100)
-    with pytest.raises(SafetyRefusal, match="too busy"), guarded(bench.drive, ENVELOPE):
+    late = pytest.raises(SafetyRefusal, match="answer took up to 50. ms, and this computer was up to 0 ms late")
+    with late as caught, guarded(bench.drive, ENVELOPE):
         pass
-    assert len(seen) >= TRIES
+    assert len(seen) >= TRIES and "bus is slow" in caught.value.likely
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def test_a_computer_that_always_stalls_shows_no_dead_man(bench: SimBench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It wakes late from its own pauses."""
+    wait, stop, stopped = bench.connection.wait, Heartbeat.stop, list[bool]()
+
+    def late(seconds: float) -> None:
+        wait(seconds + (0.4 if stopped and stopped.pop() else 0.0))
+
+    def note(self: Heartbeat) -> None:
+        stop(self)
+        stopped.append(True)
+
+    monkeypatch.setattr(bench.connection, "wait", late)
+    monkeypatch.setattr(Heartbeat, "stop", note)
+    with pytest.raises(SafetyRefusal, match="this computer was up to 4.. ms late") as caught:
+        prove_dead_man(bench.drive, Heartbeat(bench.connection))
+    assert "other programs" in caught.value.likely
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
 
 
