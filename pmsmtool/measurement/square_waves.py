@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.encoder import EncoderResult
+from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES
+from pmsmtool.estimators.injection.inductance import MINIMUM_PERIODS
 from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
@@ -81,6 +83,11 @@ def bias_and_ripple(I_test_apk: float, ripple_share: float, knee_a: float) -> tu
     return bias, clear_ripple(wanted, bias, knee_a)
 
 
+def whole_periods(half_period: int) -> int:
+    """Return the least samples of a shot that is evaluated, by its half period (control periods)."""
+    return SKIP_SAMPLES + 2 * half_period * MINIMUM_PERIODS
+
+
 @dataclass(frozen=True, slots=True)
 class SquareStage:
     """The shots on one drive, of so many samples; the other fields are those of ``measure.Measurement``."""
@@ -125,7 +132,8 @@ class SquareStage:
             rough.append(amplitude * last * self.drive.period_s / found)
             slow = square_injection.slow_half_period(plan, self.drive.period_s, rough[-1] / resistance.R_measured.value)
             if slow:
-                shot = square_injection.inject_square(self.drive, plan, axis, slow, amplitude * last / slow)
+                samples = max(plan.samples, whole_periods(slow))  # few samples are enough, few periods are not
+                shot = square_injection.inject_square(self.drive, plan, axis, slow, amplitude * last / slow, samples)
                 self.keep(f"square_{axis}_{slow}", shot)
             amplitudes[axis] = amplitude
         plan = self._further_angles(plan, encoder, knee, amplitudes)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +20,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.errors import ConfigError, ExitCode, NotAvailable
 from pmsmtool.identification.prediction import Prediction
 from pmsmtool.identification.request import IdentifyRequest, accuracy_facts, accuracy_line, dump_request, parse_request
-from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import effort, measure
 from pmsmtool.measurement.effort import ALL, LEVEL_EFFORTS, SPEED_EFFORTS, Effort, effort_for
@@ -150,6 +151,19 @@ def test_levels_that_are_not_good_enough_are_followed_by_more(tmp_path: Path, mo
     trace = read_trace(run.path / "traces" / "levels.npz")
     assert len(trace) == 2 * (len(LEVEL_EFFORTS[1].magnitudes(1.0)) + len(LEVEL_EFFORTS[1].low))
     assert stage.status == "partial"
+
+
+@pytest.mark.chain
+def test_few_samples_still_hold_the_periods_of_a_slow_square_wave(tmp_path: Path) -> None:
+    base = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
+    fast = replace(base, inverter=replace(base.inverter, f_s_hz=24e3))  # 560 samples are 20 periods of 0.6 ms each
+    (tmp_path / "fast.toml").write_text(dump_machine_file(fast), encoding="utf-8")
+    run = RunDirectory.create(tmp_path, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
+    with Connection(PmsmSimBus(f"{tmp_path / 'fast.toml'}?nv=:memory:")) as connection:
+        request = IdentifyRequest(quantities=("L",), accuracy=0.01)
+        stage = identify(run, CanopenDrive(connection, 1), request, lambda lines: None, lambda text: None)
+    assert not stage.refused
+    assert {"L_d_h", "L_q_h"} <= {value["name"] for value in stage.values}
 
 
 def test_speeds_that_are_not_enough_are_followed_by_all(monkeypatch: pytest.MonkeyPatch) -> None:
