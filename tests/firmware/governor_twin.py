@@ -31,6 +31,7 @@ from tests.firmware.projection_twin import (
 
 EMPTY, STEERED = 254, 250
 EMPTY_MARGIN, HOLD_SHARE, LANDING_REST, ACCURACY, CLOSE_SHARE = f(1.00001), f(0.99), f(0.26), f(1e-2), f(0.95)
+LANDING_PERIODS = f(6)
 STILL_SHARE, MODEL_SHARE = f(0.2), f(0.1)
 MEAN_WEIGHT, SURE_SHARE, SLOW_GAIN, NEAR_SHARE = f(0.05), f(0.01), f(0.1), f(0.2)
 SHRINK, FORCED, FASTER = f(0.85), f(1.2), f(1.4)
@@ -255,14 +256,17 @@ class GovernedTwin(Twin):
         return v
 
     def land(self, now: Row, r: Vector) -> Vector:
-        landing, self.landing, self.time_to_go = self.landing, False, ZERO
+        landing, left = self.landing, self.time_to_go
+        self.landing, self.time_to_go = False, ZERO
         if not landing or self.off_model:
             return r
-        self.binding = STEERED
         out = []
         for k, axis in enumerate("dq"):
             gain = (ONE - LANDING_REST) * self[f"motor.L_{axis}_h"] / ((now.dd, now.qq)[k] * self.T_s)
             out.append(self.i[k] + gain * (r[k] - self.i[k]) if gain > 1 else r[k])
+        if left > LANDING_PERIODS * self.T_s and square(now.voltage((out[0], out[1]))) > now.V * now.V:
+            return r
+        self.binding = STEERED
         return out[0], out[1]
 
     def steer(self, rows: list[Row], steady: int, offset: Vector, r: Vector, may_start: bool) -> Vector:

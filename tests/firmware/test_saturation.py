@@ -110,6 +110,13 @@ def test_steps_of_a_saturated_machine_settle_like_those_of_others() -> None:
         (24, -1986.8, (-11.16, 5.36), (4.63, 12.8)),  # without the table 4.1 A peak to peak, for ever
         (25, -1237.7, (1.57, 7.59), (2.85, 17.13)),  # 3.5 A
         (23, 1582.2, (-12.43, -4.02), (-3.06, -17.15)),  # 5.8 A
+        (
+            2502003,
+            -1714.3625,
+            (-15.7465, 8.3782),
+            (5.9652, 16.0588),
+        ),  # 0.85 A, by landings that the voltage cut
+        (2502003, 1636.3393, (-15.2123, -3.9541), (5.6438, -10.1869)),  # 1.13 A
     ],
 )
 def test_random_saturated_machines_brake_out_of_reach_without_a_limit_cycle(

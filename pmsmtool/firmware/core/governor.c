@@ -13,6 +13,7 @@
 #include "governor.h"
 
 #define LANDING_REST PMSM_C(0.26)          /* deadbeat would be 0; the rest is for an inductance that is off */
+#define LANDING_PERIODS PMSM_C(6.0)        /* before the end: farther off the error is not the way */
 #define INSIDE PMSM_C(0.9999995)           /* of the limit: rounding leaves the modulator nothing to cut */
 #define PRE_PROJECTION_MARGIN PMSM_C(0.99999)
 #define APPROACH_STEPS 2u                  /* of a row in a period */
@@ -71,12 +72,15 @@ static pmsm_real land(pmsm_real i, pmsm_real r, pmsm_real L, pmsm_real K_p, pmsm
     return (gain > PMSM_C(1.0)) ? i + gain * (r - i) : r;
 }
 
-/* An admissible request passes, but for the landing of a minimum-time transfer: that goes by the model alone. */
+/* An admissible request passes, but for the landing of a minimum-time transfer: that goes by the model alone. Far
+ * from the end one that the voltage cannot make is none: cut, it goes along the error of now instead of along the way,
+ * out of where the request is admissible, and the transfer would begin again. */
 static pmsm_dq pass(pmsm_period *period, const pmsm_governor_rows *rows, uint32_t off_model, pmsm_dq r,
                     uint32_t *binding)
 {
     pmsm_state *state = period->state;
     const uint32_t landing = state->landing;
+    const pmsm_real left = state->time_to_go;
     state->landing = 0u;
     state->time_to_go = PMSM_C(0.0);
     if (landing == 0u || off_model != 0u) {
@@ -84,6 +88,10 @@ static pmsm_dq pass(pmsm_period *period, const pmsm_governor_rows *rows, uint32_
     }
     const pmsm_dq v = {land(period->i_model.d, r.d, period->magnetics->L_d, rows->row[0].m_dd, state->derived.T_s),
                        land(period->i_model.q, r.q, period->magnetics->L_q, rows->row[0].m_qq, state->derived.T_s)};
+    if (left > LANDING_PERIODS * state->derived.T_s &&
+        pmsm_square(pmsm_voltage_of(&rows->row[0], v)) > rows->row[0].V * rows->row[0].V) {
+        return r;
+    }
     *binding = PMSM_BINDING_MINIMUM_TIME;
     return v;
 }
