@@ -163,3 +163,11 @@ def test_the_page_takes_the_counted_law_of_the_set(changes: dict[str, float], la
     assert f"`{law}`" in " ".join(page.split()) and f"{CYCLES[law][2]} at worst" in " ".join(page.split())
     assert f"most found | {STACK[law]} |" in page and f"each motor | {structure_bytes()['state']} |" in page
     assert "{" not in page and "@" not in page and max(map(len, page.splitlines())) <= 130
+
+
+def test_a_set_with_the_tables_of_a_saturated_machine_states_its_own_cost() -> None:
+    """It stated that of the constant inductances, 54 % of a period instead of 84."""
+    saturated = {"governor.mode": 3, "saturation.n_d": 7, "field_weakening.mode": 1}
+    assert counted_law(values(saturated)) == "saturated: best + table"
+    assert counted_law(values({**saturated, "governor.options": 2})) == "saturated: best + table, predictor"
+    assert period_share(values({**saturated, "inverter.T_s_ns": 83333})) > 0.8

@@ -4,11 +4,6 @@
 
 #define CURRENT_MOST PMSM_C(1e6) /* A, in a cell; NaN marks one without an operating point */
 
-typedef struct {
-    uint32_t index;    /* left node of the cell */
-    pmsm_real weight;  /* of the right node */
-} axis_place;
-
 typedef union {
     uint32_t u;
     float f;
@@ -22,9 +17,9 @@ static pmsm_real node_at(const uint32_t *axis, uint32_t k)
 }
 
 /* Bisection over at most 255 nodes: eight steps. */
-static axis_place find(const uint32_t *axis, uint32_t count, pmsm_real x, uint32_t *flags)
+static pmsm_axis_place find(const uint32_t *axis, uint32_t count, pmsm_real x, uint32_t *flags)
 {
-    axis_place place = {0u, PMSM_C(0.0)};
+    pmsm_axis_place place = {0u, PMSM_C(0.0)};
     if (count < 2u) {
         return place;
     }
@@ -55,18 +50,27 @@ static axis_place find(const uint32_t *axis, uint32_t count, pmsm_real x, uint32
     return place;
 }
 
-/* One table entry; NaN where the cell holds no operating point. */
-static pmsm_real entry(const uint32_t *table, uint32_t cell, const pmsm_params *params)
+/* A 16-bit entry in units of lsb; NaN where the cell holds no operating point. */
+static pmsm_real short_entry(uint32_t word, uint32_t shift, pmsm_real lsb)
 {
+    const uint32_t half = (word >> shift) & 0xFFFFu;
+    return (half == 0x8000u) ? (pmsm_real)__builtin_nanf("")
+                             : (pmsm_real)((int32_t)(half ^ 0x8000u) - 32768) * lsb;
+}
+
+static pmsm_dq entry(const uint32_t *table, uint32_t stride, uint32_t cell, const pmsm_params *params)
+{
+    pmsm_dq i;
     if (params->lut_format == PMSM_LUT_BINARY32) {
-        return node_at(table, cell);
+        i.d = node_at(table, cell);
+        i.q = node_at(table, stride + cell);
+    } else {
+        const pmsm_real lsb = (pmsm_real)params->lut_lsb_a;
+        const uint32_t shift = 16u * (cell & 1u);
+        i.d = short_entry(table[cell >> 1], shift, lsb);
+        i.q = short_entry(table[stride + (cell >> 1)], shift, lsb);
     }
-    const uint32_t half = (table[cell / 2u] >> (16u * (cell % 2u))) & 0xFFFFu;
-    if (half == 0x8000u) {
-        return (pmsm_real)__builtin_nanf("");
-    }
-    const int32_t value = (half < 0x8000u) ? (int32_t)half : (int32_t)half - 65536;
-    return (pmsm_real)value * (pmsm_real)params->lut_lsb_a;
+    return i;
 }
 
 typedef struct {
@@ -81,14 +85,13 @@ static void add_corner(corner_sum *sum, const uint32_t *tables, uint32_t stride,
     if (weight == PMSM_C(0.0)) {
         return;
     }
-    const pmsm_real i_d = entry(tables, cell, params);
-    const pmsm_real i_q = entry(tables + stride, cell, params);
-    if (!(pmsm_abs(i_d) + pmsm_abs(i_q) <= CURRENT_MOST)) { /* nor a number, nor one of a current */
+    const pmsm_dq i = entry(tables, stride, cell, params);
+    if (!(pmsm_abs(i.d) + pmsm_abs(i.q) <= CURRENT_MOST)) { /* nor a number, nor one of a current */
         sum->hole = 1u;
         return;
     }
-    sum->sum.d += weight * i_d;
-    sum->sum.q += weight * i_q;
+    sum->sum.d += weight * i.d;
+    sum->sum.q += weight * i.q;
     sum->weight += weight;
 }
 
@@ -127,52 +130,63 @@ static pmsm_real second_coordinate(const pmsm_period *period, const uint32_t *ax
 }
 
 /* Weighted corners of one cell. Corners without a point are left out and the rest is scaled up. */
-static corner_sum interpolate(const pmsm_params *params, const uint32_t *tables, axis_place x, axis_place y,
-                              axis_place z)
+static corner_sum interpolate(const pmsm_params *params, const pmsm_lookup_row *row, pmsm_axis_place x)
 {
     const uint32_t n_y = params->lut_n_y;
     const uint32_t n_z = params->lut_n_z;
     const uint32_t cells = params->lut_n_x * n_y * n_z;
     const uint32_t stride = (params->lut_format == PMSM_LUT_BINARY32) ? cells : (cells + 1u) / 2u;
+    const pmsm_real z_left = PMSM_C(1.0) - row->z.weight;
+    const uint32_t right = n_y * n_z; /* cells from a node of x to the next */
+    uint32_t cell = (x.index * n_y + row->y.index) * n_z + row->z.index;
+    pmsm_real w_x = PMSM_C(1.0) - x.weight;
     corner_sum sum = {{PMSM_C(0.0), PMSM_C(0.0)}, PMSM_C(0.0), 0u};
-    for (uint32_t k = 0u; k < 8u; k++) {
-        const uint32_t right_x = k >> 2;
-        const uint32_t right_y = (k >> 1) & 1u;
-        const uint32_t right_z = k & 1u;
-        if (right_z > 0u && n_z < 2u) {
-            continue;
+    for (uint32_t k = 0u; k < 2u; k++) {
+        const pmsm_real low = w_x * (PMSM_C(1.0) - row->y.weight);
+        const pmsm_real high = w_x * row->y.weight;
+        add_corner(&sum, row->tables, stride, cell, low * z_left, params);
+        if (n_z > 1u) {
+            add_corner(&sum, row->tables, stride, cell + 1u, low * row->z.weight, params);
         }
-        const pmsm_real w_x = (right_x != 0u) ? x.weight : PMSM_C(1.0) - x.weight;
-        const pmsm_real w_y = (right_y != 0u) ? y.weight : PMSM_C(1.0) - y.weight;
-        const pmsm_real w_z = (right_z != 0u) ? z.weight : PMSM_C(1.0) - z.weight;
-        const uint32_t cell = ((x.index + right_x) * n_y + (y.index + right_y)) * n_z + (z.index + right_z);
-        add_corner(&sum, tables, stride, cell, (w_x * w_y) * w_z, params);
+        add_corner(&sum, row->tables, stride, cell + n_z, high * z_left, params);
+        if (n_z > 1u) {
+            add_corner(&sum, row->tables, stride, cell + n_z + 1u, high * row->z.weight, params);
+        }
+        cell += right;
+        w_x = x.weight;
     }
     return sum;
 }
 
+pmsm_lookup_row pmsm_lookup_at_speed(pmsm_period *period)
+{
+    const pmsm_params *params = period->params;
+    const uint32_t *axis_y = period->lut + params->lut_n_x;
+    const uint32_t *axis_z = axis_y + params->lut_n_y;
+    pmsm_real y = second_coordinate(period, axis_y);
+    pmsm_lookup_row row;
+    row.sign = PMSM_C(1.0);
+    if (period->omega_M < PMSM_C(0.0) && node_at(axis_y, 0u) >= PMSM_C(0.0)) {
+        row.sign = PMSM_C(-1.0);
+        y = pmsm_abs(y);
+    }
+    row.tables = axis_z + params->lut_n_z;
+    row.y = find(axis_y, params->lut_n_y, y, &period->flags);
+    row.z = find(axis_z, params->lut_n_z, period->U_dc, &period->flags);
+    return row;
+}
+
 /* A table of one quadrant serves the others: (T, w) -> (-T, -w) with i_q -> -i_q is exact; a torque axis that starts
  * at zero is mirrored as well, which leaves the resistance out of the braking quadrant. */
-pmsm_dq pmsm_lookup(pmsm_period *period, pmsm_real tau)
+pmsm_dq pmsm_lookup(pmsm_period *period, const pmsm_lookup_row *row, pmsm_real tau)
 {
     const pmsm_params *params = period->params;
     const uint32_t *axis_x = period->lut;
-    const uint32_t *axis_y = axis_x + params->lut_n_x;
-    const uint32_t *axis_z = axis_y + params->lut_n_y;
-    const uint32_t *tables = axis_z + params->lut_n_z;
-    pmsm_real y = second_coordinate(period, axis_y);
-    pmsm_real sign = PMSM_C(1.0);
-    if (period->omega_M < PMSM_C(0.0) && node_at(axis_y, 0u) >= PMSM_C(0.0)) {
-        sign = PMSM_C(-1.0);
-        y = pmsm_abs(y);
-    }
+    pmsm_real sign = row->sign;
     if (node_at(axis_x, 0u) >= PMSM_C(0.0)) {
         sign = (tau < PMSM_C(0.0)) ? PMSM_C(-1.0) : PMSM_C(1.0);
     }
-    const axis_place place_x = find(axis_x, params->lut_n_x, sign * tau, &period->flags);
-    const axis_place place_y = find(axis_y, params->lut_n_y, y, &period->flags);
-    const axis_place place_z = find(axis_z, params->lut_n_z, period->U_dc, &period->flags);
-    const corner_sum sum = interpolate(params, tables, place_x, place_y, place_z);
+    const corner_sum sum = interpolate(params, row, find(axis_x, params->lut_n_x, sign * tau, &period->flags));
     pmsm_dq i = {(pmsm_real)params->field_weakening_i_d_min_a, PMSM_C(0.0)};
     period->flags |= (sum.hole != 0u) ? (uint32_t)PMSM_FLAG_LUT_NO_POINT : 0u;
     if (sum.weight > PMSM_C(0.0)) {

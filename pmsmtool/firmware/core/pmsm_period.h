@@ -56,8 +56,18 @@ pmsm_real pmsm_torque(const pmsm_params *params, const pmsm_magnetics *magnetics
 /* field_weakening.c: currents of a torque by optimisation, every N_fw periods; sets the flag of an empty set */
 pmsm_dq pmsm_field_weakening(pmsm_period *period, pmsm_real tau);
 
-/* lookup.c: currents of a torque from the tables; sets the look-up flags */
-pmsm_dq pmsm_lookup(pmsm_period *period, pmsm_real tau);
+/* lookup.c: currents of a torque from the tables; sets the look-up flags. Speed and link are placed once. */
+typedef struct {
+    uint32_t index;   /* left node of the cell */
+    pmsm_real weight; /* of the right node */
+} pmsm_axis_place;
+typedef struct {
+    const uint32_t *tables;
+    pmsm_axis_place y, z;
+    pmsm_real sign; /* of torque and i_q, where the speed is mirrored */
+} pmsm_lookup_row;
+pmsm_lookup_row pmsm_lookup_at_speed(pmsm_period *period);
+pmsm_dq pmsm_lookup(pmsm_period *period, const pmsm_lookup_row *row, pmsm_real tau);
 
 /* current.c */
 uint32_t pmsm_uses_predictor(const pmsm_params *params);

@@ -91,18 +91,19 @@ static pmsm_dq lookup_within_limit(pmsm_period *period, pmsm_real tau)
 {
     const pmsm_real limit = pmsm_current_limit(period);
     const pmsm_real square = limit * limit;
-    pmsm_dq outside = pmsm_lookup(period, tau);
+    const pmsm_lookup_row row = pmsm_lookup_at_speed(period);
+    pmsm_dq outside = pmsm_lookup(period, &row, tau);
     if (pmsm_square(outside) <= square) {
         return outside;
     }
     const uint32_t flags = period->flags | (uint32_t)PMSM_FLAG_CURRENT_LIMITED;
-    pmsm_dq inside = pmsm_lookup(period, PMSM_C(0.0));
+    pmsm_dq inside = pmsm_lookup(period, &row, PMSM_C(0.0));
     if (pmsm_square(inside) < square) {
         pmsm_real low = PMSM_C(0.0);
         pmsm_real high = tau;
         for (uint32_t k = 0u; k < LIMITED_LOOKUPS; k++) {
             const pmsm_real middle = low + way_out(inside, outside, square) * (high - low);
-            const pmsm_dq i = pmsm_lookup(period, middle);
+            const pmsm_dq i = pmsm_lookup(period, &row, middle);
             if (pmsm_square(i) < square) {
                 inside = i;
                 low = middle;
