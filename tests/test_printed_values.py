@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import pmsmtool
+from pmsmtool.cli.margins import _sample
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.lookup.design import LookupDesign
 from pmsmtool.design.loops.margins import MarginReport
@@ -105,3 +106,8 @@ def test_a_signal_that_is_not_there_names_the_nearest() -> None:
 def test_a_number_in_place_of_a_schedule_says_how_to_write_it() -> None:
     with pytest.raises(pmsmtool.PmsmtoolError, match=r"i_q_a is a number; write \[\(0.0, 5\)\]"):
         pmsmtool.Scenario("step", 0.06, "current", {"i_q_a": 5})  # type: ignore[dict-item]
+
+
+def test_a_machine_of_the_tolerance_box_shows_factors_as_such() -> None:
+    """Before, 0.902 of the nominal inductance was printed ``L_d_h 0.902``: that reads as 0.902 H."""
+    assert _sample({"L_d_h": 0.902, "U_dc_v": 513.0}) == "L_d_h x 0.902, U_dc_v 513"

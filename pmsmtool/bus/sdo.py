@@ -519,8 +519,10 @@ class SdoChannel:
         self.retries += tries - 1
         where = self._where(attempt)
         alike = all(note == f"try {k}: {lost.what}" for k, note in enumerate(attempt.notes, 1))
-        told = f"{tries} tries" if alike else f"{tries} tries: {'; '.join(attempt.notes)}"
-        what = lost.what if tries == 1 else f"{lost.what} ({told})"
+        silent = all(": no answer to " in note for note in attempt.notes)  # each may have waited for another frame
+        told = f"{tries} tries" if alike or silent else f"{tries} tries: {'; '.join(attempt.notes)}"
+        first = attempt.notes[0].partition(": ")[2] if silent and attempt.notes else lost.what
+        what = first if tries == 1 else f"{first} ({told})"
         if lost.code == AbortCode.TIMED_OUT:
             likely, hint = self.connection.explain_silence(self.node)
             if lost.likely:

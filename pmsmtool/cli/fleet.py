@@ -168,8 +168,15 @@ class _Unattended:
 def _ask(
     lines: list[str], due: list[Download], bus: BusOptions, motion: MotionOptions, out: Output, *, store: bool
 ) -> None:
-    from pmsmtool.cli.consent import ask_writing
+    from pmsmtool.cli.consent import ask_writing, person_present
+    from pmsmtool.errors import Declined
 
+    if motion.yes and not bus.simulated() and not person_present():
+        raise Declined(
+            "no terminal to ask for consent to write to these drives: nothing was done",
+            likely="--yes of several drives needs the list of their serial numbers",
+            hint="--yes --serials FILE, with a line `node serial` for each drive as `pmsmtool scan` shows them",
+        )
     after = [f"node {job.node.node}: {line}" for job in due for line in job.plan.after_lines(store=store)]
     serial = min(job.identity.serial for job in due)  # 0 where one of them tells none
     ask_writing([*lines, *after], motion, simulated=bus.simulated(), serial=serial, out=out)

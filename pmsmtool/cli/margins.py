@@ -200,8 +200,9 @@ def _simulated_lines(simulated: SimulatedMargins) -> Iterator[str]:
 
 
 def _sample(sample: Mapping[str, float]) -> str:
-    """Return a machine of the box: factors over nominal, then absolutes."""
-    return ", ".join(f"{name} {value:.4g}" for name, value in sample.items())
+    """Return a machine of the box: factors over nominal (``x``), then absolutes."""
+    absolute = ("encoder_rad", "T_winding_c", "T_magnet_c", "U_dc_v", "operating_point")
+    return ", ".join(f"{name} {'' if name in absolute else 'x '}{value:.4g}" for name, value in sample.items())
 
 
 def _table(spreads: Sequence[Spread] | Sequence[Observed], worst: str = "worst corner") -> list[str]:

@@ -17,6 +17,7 @@ import pytest
 from pmsmtool.bus.examination import no_rate
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.cli.main import run
+from pmsmtool.cli.options import BusOptions
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map
@@ -370,6 +371,19 @@ def test_an_unattended_fleet_needs_a_proven_set_and_its_serial_numbers(tool: Too
     code, _, err = tool(*given)
     assert code == 2 and "--canary RUN_DIR" in err
     assert tool("flash-params", wanted, "--yes", "--serials", "serials.txt")[0] == 2, "it is about several nodes"
+
+
+def test_yes_for_several_drives_asks_for_their_list(tool: Tool, wanted: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, it asked for --serial, which a command for several drives refuses."""
+    monkeypatch.setattr(BusOptions, "simulated", lambda _: False)
+    code, _, err = tool("flash-params", wanted, "--nodes", "1", "--yes")
+    assert code == 7 and "--yes --serials FILE" in err and "--serial " not in err
+
+
+def test_a_wrong_node_id_is_told_in_one_short_line(tool: Tool) -> None:
+    code, _, err = tool("info", "-n", "5")
+    assert code == 3 and "no answer to the upload request within 0.3 s (3 tries)\n" in err
+    assert "only others were heard, node 1: wrong node id?" in err and "`pmsmtool scan` without -n" in err
 
 
 def test_fleet_with_one_bad_drive_serves_the_others(tool: Tool, wanted: str, tmp_path: Path) -> None:
