@@ -64,6 +64,7 @@ ONE_STAGE = ("identify", "track", "prove", MOVE)
 """Commands whose run is one stage of the same name."""
 CHAINS = ("commission", "fleet")
 """Commands whose run is a full commissioning."""
+NO_DATA_SHEET = "Data sheet: no machine file was given, so the measured values were compared with none."
 NOTHING_COMPARED = "What the drive holds and how it behaves: neither was compared with the design."
 
 
@@ -90,6 +91,9 @@ def report_page(path: str | Path) -> str:
     not_checked = NOT_CHECKED[1:] if record.passed("prove") else NOT_CHECKED
     if not any(record.passed(stage) for stage in ("flash", "verify", "prove")):
         not_checked = (NOTHING_COMPARED, *NOT_CHECKED[1:])
+    identified = record.stage("identify")
+    if identified is not None and identified.comparison and not any(row.get("stated") for row in identified.comparison):
+        not_checked = (*not_checked, NO_DATA_SHEET)
     if not is_simulated(asdict(record)) and record.bus.get("interface") in SERVED:
         not_checked = (ANY_DRIVE.format(record.bus["interface"]), *not_checked)
     again = recomputed(design) if design is not None and "current_q" in design.loops else None

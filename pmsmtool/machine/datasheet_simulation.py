@@ -5,13 +5,10 @@ from __future__ import annotations
 
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.simulation_keys import FULL_SCALE_SHARE, PEAK_SHARE
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import format_quantity
 
-PEAK_SHARE = 2.0
-"""Short-time over rated current where only one is stated; servo motors have 2 to 4."""
-FULL_SCALE_SHARE = 1.5
-"""Full scale of the current measurement over the largest current."""
 NOISE_SHARE = 5e-4
 """Standard deviation of a phase current sample, of full scale; that of the shipped profiles."""
 ENCODER_BITS = 17

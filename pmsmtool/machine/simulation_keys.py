@@ -74,7 +74,7 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number("sensor_lag_s", "s", 0, 1e-3, 0.0, "time constant of the current sensors"),
     _number("sensor_noise_apk", "A", 0, 100, 0.0, "standard deviation of a phase current sample"),
     _whole("adc_bits", 0, 24, 12, "resolution of the current ADC, 0 none"),
-    _number("adc_full_scale_apk", "A", 1e-3, 1e5, None, "current at full scale of the ADC; default 1.5 I_max"),
+    _number("adc_full_scale_apk", "A", 1e-3, 1e5, None, "full scale of the ADC; default 1.5 I_max, or 3 I_nom"),
     _number("sampling_shift_s", "s", -1e-4, 1e-4, 0.0, "sampling instant after the PWM centre"),
     _number("U_dc_gain", "1", 0.5, 2, 1.0, "gain of the DC-link measurement"),
     _whole("encoder_bits", 0, 32, 17, "resolution of the encoder per turn, 0 none"),
@@ -151,6 +151,12 @@ SIMULATION_KEYS: tuple[Key, ...] = (
 )
 
 
+PEAK_SHARE = 2.0
+"""Short-time over rated current where only one is stated; servo motors have 2 to 4."""
+FULL_SCALE_SHARE = 1.5
+"""Full scale of the current measurement over the largest current."""
+
+
 def resolved_simulation(given: dict[str, Value], tables: dict[str, dict[str, Value]]) -> dict[str, Value]:
     """Return every simulation key with its value.
 
@@ -172,8 +178,10 @@ def resolved_simulation(given: dict[str, Value], tables: dict[str, dict[str, Val
         if value is None and key.falls_back:
             table, name = key.falls_back[1:].split("] ")
             value = tables.get(table, {}).get(name)
-        if value is None and key.name == "adc_full_scale_apk" and "I_max_apk" in tables.get("machine", {}):
-            value = 1.5 * float(tables["machine"]["I_max_apk"])  # type: ignore[arg-type]
+        if value is None and key.name == "adc_full_scale_apk":
+            machine = tables.get("machine", {})
+            largest = machine.get("I_max_apk") or PEAK_SHARE * float(machine.get("I_nom_apk") or 0.0)  # type: ignore[arg-type]
+            value = FULL_SCALE_SHARE * float(largest) or None
         if value is not None:
             resolved[key.name] = value
     return resolved

@@ -278,7 +278,7 @@ def _sensors(out: Any, machine_file: MachineFile, settings: Settings, violations
     out.adc_bits, out.full_scale = settings.whole("adc_bits"), settings.number("adc_full_scale_apk")
     if out.adc_bits and not out.full_scale:
         violations.append(
-            "adc_bits needs adc_full_scale_apk in [simulation] or I_max_apk in [machine]; adc_bits = 0: none"
+            "adc_bits needs adc_full_scale_apk in [simulation], or I_max_apk or I_nom_apk in [machine]; or set it to 0"
         )
     out.encoder_bits, out.U_dc_gain = settings.whole("encoder_bits"), settings.number("U_dc_gain")
     out.encoder_offset_e = settings.number("encoder_offset_rad")

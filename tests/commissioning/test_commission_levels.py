@@ -19,7 +19,7 @@ from pmsmtool.cli.main import cli
 from pmsmtool.commissioning.closed_stage import LIMITS, NO_BANDWIDTH, NO_INERTIA, why_no_limits
 from pmsmtool.commissioning.commission import Commissioning, begin_run, due_stages
 from pmsmtool.commissioning.rated_limits import NAMES
-from pmsmtool.commissioning.report_page import report_page, verdict
+from pmsmtool.commissioning.report_page import NO_DATA_SHEET, report_page, verdict
 from pmsmtool.design.closed_drive import RATED, SLOPE, SPEED, TORQUE
 from pmsmtool.design.design_file import load_design
 from pmsmtool.design.loops.open_loops import lacking_gains
@@ -251,7 +251,12 @@ def test_a_file_of_other_pole_pairs_than_the_drive_holds_writes_nothing(tmp_path
     rows = {row["name"]: row for row in run.read().stage("identify").comparison}  # type: ignore[union-attr]
     assert (rows["pole_pairs"]["stated"], rows["pole_pairs"]["held"]) == (7, 3)
     assert rows["R_s_ohm"]["verdict"] == "NOT CHECKED"
-    assert "Data sheet, drive, measured" in report_page(run.path)
+    page = report_page(run.path)
+    assert "Data sheet, drive, measured" in page and NO_DATA_SHEET not in page
+    stage = run.read().stage("identify")
+    without = [{**row, "stated": None} for row in stage.comparison]  # type: ignore[union-attr]
+    run.write(replace(run.read(), stages=(replace(stage, comparison=without),)))  # type: ignore[type-var]
+    assert NO_DATA_SHEET in report_page(run.path)
 
 
 def test_recorder_level_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Path) -> None:

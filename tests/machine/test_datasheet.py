@@ -4,6 +4,7 @@
 import itertools
 import json
 import math
+from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
@@ -159,6 +160,17 @@ def test_what_a_rehearsal_needs_is_written_and_named(rated, assumed):
     assert [step.given for step in result.conversions if step.key == "[simulation]"] == ["assumed"] * assumed
     if rated is not None:
         assert settings.number("J_kgm2") > 0.0 and settings.number("adc_full_scale_apk") == 1.5 * 2.0 * rated
+
+
+def test_a_machine_without_the_table_of_a_rehearsal_has_the_same_current_measurement():
+    """As `identify` writes it; before, `simulate RUN` and the page of its report refused the rehearsed motor."""
+    written = machine_from_datasheet(sheet(I_nom_apk=20.0)).machine_file
+    bare = replace(written, simulation={})
+    assert settings_of(bare).number("adc_full_scale_apk") == settings_of(written).number("adc_full_scale_apk") == 60.0
+    largest = replace(bare, machine=replace(bare.machine, I_max_apk=30.0))
+    assert settings_of(largest).number("adc_full_scale_apk") == 45.0
+    none = replace(bare, machine=replace(bare.machine, I_nom_apk=None))
+    assert not settings_of(none).number("adc_full_scale_apk")
 
 
 def test_small_disagreement_is_production_spread():
