@@ -179,9 +179,11 @@ def resolved_simulation(given: dict[str, Value], tables: dict[str, dict[str, Val
             table, name = key.falls_back[1:].split("] ")
             value = tables.get(table, {}).get(name)
         if value is None and key.name == "adc_full_scale_apk":
-            machine = tables.get("machine", {})
-            largest = machine.get("I_max_apk") or PEAK_SHARE * float(machine.get("I_nom_apk") or 0.0)  # type: ignore[arg-type]
-            value = FULL_SCALE_SHARE * float(largest) or None
+            largest, rated = (tables.get("machine", {}).get(name) for name in ("I_max_apk", "I_nom_apk"))
+            if isinstance(largest, float | int):
+                value = FULL_SCALE_SHARE * largest
+            elif isinstance(rated, float | int):
+                value = FULL_SCALE_SHARE * PEAK_SHARE * rated
         if value is not None:
             resolved[key.name] = value
     return resolved
