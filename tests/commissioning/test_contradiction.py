@@ -229,6 +229,17 @@ def test_a_memory_of_another_motor_checks_nothing_of_what_was_refused() -> None:
     assert wrong(compare(TRUTH, other, only, used=("pole_pairs",))) == ["pole_pairs"]
 
 
+def test_a_value_that_is_hardly_known_checks_nothing() -> None:
+    """R within the knee of the inverter's error, known to +-98 %, agreed with every data sheet."""
+    R = TRUTH.machine.R_s_ohm
+    for half, verdict in ((0.45, "agrees"), (0.98, "NOT CHECKED")):
+        values = [*(v for v in measured() if v["name"] != "R_s_ohm"), value("R_s_ohm", R, half=half)]
+        rows = compare(TRUTH, {}, values)
+        assert found(rows)["R_s_ohm"] == verdict
+        assert ("R_s_ohm" in unchecked([row.facts() for row in rows])) == (verdict == "NOT CHECKED")
+    assert wrong(compare(stated(R_s_ohm=3.0), {}, [value("R_s_ohm", R, half=0.6)])) == ["R_s_ohm"]
+
+
 def test_a_refused_value_checks_nothing() -> None:
     values = [{**v, "accepted": v["name"] != "R_s_ohm"} for v in measured(R_s_ohm=9.9)]
     assert found(compare(TRUTH, {}, values))["R_s_ohm"] == "NOT CHECKED"
