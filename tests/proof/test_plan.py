@@ -21,7 +21,8 @@ from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.proof.drawn_machine import EMF_HARMONICS, LAG_SHARES
-from pmsmtool.proof.plan import RPM, SIGNALS, STEPS, Conditions, plan_proof
+from pmsmtool.proof.judgement import LEAST_STEADY_ROWS
+from pmsmtool.proof.plan import LONGEST_S, RPM, SIGNALS, STEPS, WEAKENING_SLOPE, Conditions, plan_proof
 from pmsmtool.proof.simulated import BASE_SPEED, SimulatedDrives
 from pmsmtool.proof.stage import ProofRequest, envelope_of
 from pmsmtool.resources import data_folder
@@ -162,6 +163,26 @@ def test_the_proof_stays_below_uncontrolled_generation_unless_a_fault_shorts_the
         assert plan_proof(in_file, conditions(in_file)) == plan_proof(free, conditions(free))
         shorted = changed(close, protection__n_short_circuit_rpm=limit_rpm)
         assert plan_proof(shorted, conditions(shorted)) == plan_proof(free, conditions(free))
+
+
+@pytest.mark.parametrize("heavier", [1.0, 4.0, 12.0, 40.0, 400.0])
+def test_a_record_of_a_speed_ends_behind_its_ramp_however_heavy_the_shaft(heavier: float) -> None:
+    """Before, both ramps ended behind their records: with no steady end, and before field weakening."""
+    made = design()
+    made = changed(made, speed__acceleration_rpm_per_s=made["speed.acceleration_rpm_per_s"] / heavier)
+    plan = plan_proof(made, conditions(made))
+    slope = made["speed.acceleration_rpm_per_s"] * RPM
+    entries = {e.name: e for e in plan.experiments if e.excitation.point is Injection.SPEED and e.move is None}
+    for e, steepness in ((entries["speed_step"], 1.0), (entries.get("weakening"), WEAKENING_SLOPE)):
+        if e is None:
+            assert heavier == 400.0 and any("the shaft takes more than 3 s" in line for line in plan.left_out)
+            continue
+        seconds = e.rows * e.decimation * made.machine.inverter.T_s
+        assert e.excitation.amplitude / (steepness * slope) < seconds < LONGEST_S * 1.02  # rows are whole periods
+        assert e.steady_rows >= LEAST_STEADY_ROWS
+    if "weakening" in entries:
+        corner = made.machine.inverter.V_max_v / made["motor.psi_f_wb"] / made["motor.pole_pairs"]
+        assert entries["weakening"].base_rad_s + entries["weakening"].excitation.amplitude > 0.98 * corner
 
 
 def light(J_kgm2: float = 1.2e-5, psi_f_wb: float = 0.02) -> MachineFile:
