@@ -106,7 +106,8 @@ def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Gener
     """Draw eddy currents about those that the inductances were identified with; none where there were none.
 
     Within a control period they are nothing but iron loss; slower ones are a branch, whose time constant the plant has
-    once for both axes.
+    once for both axes. At standstill such a loss is hardly told from a late sample; it brakes, and no more than B says:
+    of a traction machine it came out 8 times too large, and drawn drives lost their current control.
     """
     sizes_s = [machine.conditions.get(f"eddy_{axis}_s", 0.0) for axis in "dq"]
     taus_s = [tau for axis in "dq" if isinstance(tau := machine.conditions.get(f"eddy_{axis}_time_s"), float)]
@@ -119,7 +120,10 @@ def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Gener
     if np.mean(taus_s) < T_s:
         if sum(per_volt) > 0.0:
             out.R_iron = 2.0 / sum(per_volt)
-            out.B = max(0.0, out.B - iron_drag(out.pole_pairs, out.psi_f, out.R_iron))  # identified as one
+            drag = iron_drag(out.pole_pairs, out.psi_f, out.R_iron)
+            if machine.machine.B_nms is not None and drag > out.B > 0.0:
+                out.R_iron *= drag / out.B
+            out.B = max(0.0, out.B - drag)  # identified as one
         return
     out.eddy_rate = 1.0 / max(tau_s, T_s)  # shorter than a step of the plant would not be integrated
     out.eddy_d, out.eddy_q = (amperes * out.eddy_rate for amperes in per_volt)

@@ -20,7 +20,8 @@ from pmsmtool.identification.mechanics import PLAY_FALLBACK
 from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
-from pmsmtool.proof.drawn_machine import EMF_HARMONICS, LAG_SHARES
+from pmsmtool.machine.torque import iron_drag
+from pmsmtool.proof.drawn_machine import EMF_HARMONICS, FRICTION_FACTOR, LAG_SHARES
 from pmsmtool.proof.judgement import LEAST_STEADY_ROWS
 from pmsmtool.proof.plan import LONGEST_S, RPM, SIGNALS, STEPS, WEAKENING_SLOPE, Conditions, plan_proof
 from pmsmtool.proof.simulated import BASE_SPEED, SimulatedDrives
@@ -290,6 +291,18 @@ def test_an_angle_may_be_as_old_as_the_voltage_at_speed_shows() -> None:
     setups = SimulatedDrives(made, limits, plan_proof(made, limits), 16, 0).setups
     ages = {round(1e6 * one.sensors.encoder_latency) for one in setups}
     assert ages - {0} and min(ages - {0}) >= 40, "half of the drives have all of it as an old angle"
+
+
+def test_an_iron_loss_of_the_prediction_brakes_no_more_than_friction_does() -> None:
+    """One that a late sample made 8 times too large let the drawn machines of a healthy drive run away."""
+    source = light()
+    T_s = source.inverter.T_s
+    branch = {f"eddy_{axis}{of}": size * T_s for axis in "dq" for of, size in (("_s", 1.1), ("_time_s", 0.1))}
+    made = tune(replace(source, conditions={**source.conditions, **branch}), TuneRequest())
+    limits = conditions(made, U_dc_v=24.0)
+    machines = [one.machine for one in SimulatedDrives(made, limits, plan_proof(made, limits), 16, 0).setups]
+    drags = [iron_drag(one.pole_pairs, one.psi_f, one.R_iron) for one in machines]
+    assert all(0.0 < drag <= 1.001 * FRICTION_FACTOR * (source.machine.B_nms or 0.0) for drag in drags)
 
 
 def test_the_prediction_has_harmonics_and_the_noise_of_the_encoder() -> None:
