@@ -38,8 +38,10 @@ COAST_UNITS, COAST_LEAST_S, COAST_MOST_S = 6.0, 0.5, 2.5
 """Time of coasting, in pushes, and its bounds."""
 LEFT_LEAST = 0.5
 """Speed at the begin of a coasting, of that at the end of the push, below which most of it was over before."""
-CURRENT_OFF = 0.05
-"""Current, of the push's, below which a shaft coasts."""
+CURRENT_OFF = 0.15
+"""Current, of the push's, below which it is over. What flows then is known, and counts as a torque: a loop whose
+integral follows the falling back-EMF lets 8 % flow on a light shaft until friction has stopped it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +133,9 @@ def _coast(drive: Drive, plan: MechanicsPlan) -> Trace:
 
 def _parts(whole: Trace, i_q_a: float, push_s: float) -> tuple[Trace, Trace]:
     """Return push and coasting of a record that has both."""
-    flows = np.nonzero(np.abs(whole["i_q_a"]) > CURRENT_OFF * abs(i_q_a))[0]
     pushed = int(push_s / whole.period_s)
-    # a current may stay away, or not go
-    ends = pushed, min(max([pushed, *(flows[-1:] + 1)]), len(whole) - 2)
+    over = np.nonzero(np.abs(whole["i_q_a"][pushed:]) <= CURRENT_OFF * abs(i_q_a))[0]
+    ends = pushed, min(pushed + (int(over[0]) if len(over) else len(whole)), len(whole) - 2)  # a current may not go
     push, coasting = (
         replace(whole, t_s=whole.t_s[part] - whole.t_s[part][0], signals={n: whole[n][part] for n in whole.signals})
         for part in (slice(0, ends[0]), slice(ends[1], None))

@@ -107,10 +107,11 @@ def test_a_shaft_that_friction_stops_while_its_push_is_read_out_coasts_within_th
         assert abs(found[name]["value"] - true) < found[name]["total_95"] < WITHIN[name] * true, name
 
 
-@pytest.mark.parametrize(("current", "begins"), [([4.0] * 60 + [1.0, 0.3] + [0.0] * 138, 62), ([0.0] * 200, 60),
-                                                 ([4.0] * 200, 198), ([4.0] * 30 + [0.0] * 170, 60)])  # fmt: skip
+@pytest.mark.parametrize(("current", "begins"), [([4.0] * 60 + [1.0, 0.9] + [0.0] * 138, 62), ([0.0] * 200, 60),
+                                                 ([4.0] * 200, 198), ([4.0] * 30 + [0.0] * 170, 60),
+                                                 ([4.0] * 60 + [1.0] + [0.4] * 139, 61)])  # fmt: skip
 def test_a_record_of_push_and_coasting_is_cut_where_the_current_has_gone(current: list[float], begins: int) -> None:
-    """A current that never came ended in exit 70."""
+    """A current that never came ended in exit 70; one that the back-EMF keeps flowing left no coasting."""
     t, theta = 1e-3 * np.arange(200), np.linspace(0.0, 1.0, 200)
     signals = {"theta_M_rad": theta, "i_d_a": np.zeros(200), "i_q_a": np.array(current), "flagged": np.zeros(200)}
     push, coasting = _parts(Trace(t, signals, dict.fromkeys(signals, "1"), {"coasting": False}), 4.0, 0.0605)
