@@ -69,8 +69,8 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
     (
         "E_SNR",
         "the predicted standard deviation is above the limit",
-        "too small an amplitude for the noise of this current measurement",
-        "raise the amplitude (--i-max)",
+        "too small an amplitude for the noise of this current measurement, or the machine file of another motor",
+        "raise the amplitude (--i-max); `pmsmtool check MACHINE` compares the file with what is connected",
     ),
     (
         "E_COHERENCE",

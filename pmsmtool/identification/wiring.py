@@ -266,7 +266,8 @@ def judge_supply(U_rest_v: float, turn: Trace | None, U_stated_v: float | None) 
     if U_stated_v is not None and not low * U_stated_v <= U_rest_v <= high * U_stated_v:
         return Finding(
             "supply", WRONG, f"DC link {U_rest_v:.4g} V{stated}",
-            "supply off, or set to another voltage" if U_rest_v < U_stated_v else "another supply than was stated",
+            "supply off, or set to another voltage" if U_rest_v < U_stated_v
+            else "another supply, or the file of another motor",
         )  # fmt: skip
     if turn is not None:
         least = float(np.min(turn["U_dc_v"]))

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.commissioning.first_check import fault_row
-from pmsmtool.identification.wiring import WRONG
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.identification.wiring import WRONG, judge_supply
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from tests.cli.conftest import Tool
@@ -57,6 +58,14 @@ def test_the_first_wrong_row_is_what_was_done(extra: str, wrong: str, tool: Tool
     assert "duration  at most 15 s" in told and "travel    450 deg" in told
     assert ("voltage off, drive restored" in told) == (extra != "U_dc_v = 300.0")
     assert ("input is open; the DC link has 540 V" in told) == ("safe_torque_off" in extra)
+
+
+def test_the_file_of_another_motor_is_among_the_causes() -> None:
+    """A 48 V motor's file at a drive of 540 V: `identify` named the amplitude alone, and `check` the supply."""
+    assert "the file of another motor" in judge_supply(540.0, None, 48.0).likely
+    assert judge_supply(2.0, None, 48.0).likely == "supply off, or set to another voltage"
+    error = refuse("E_SNR", "too wide", stage="plan")
+    assert "the machine file of another motor" in error.likely and "`pmsmtool check MACHINE`" in error.hint
 
 
 def test_nothing_moves_without_consent(tool: Tool) -> None:
