@@ -52,7 +52,8 @@ LIMITS = ("current", "speed")
 )
 @click.argument("machine", required=False, type=FILE)
 @click.option("--resume", type=FOLDER, metavar="RUN_DIR", help="Go on with a run where it ended.")
-@click.option("--rehearse", metavar="FAMILY", help="Rehearse: MACHINE, simulated, behind the map of a drive family.")
+@click.option("--rehearse", is_flag=False, flag_value="", metavar="FAMILY", help="Rehearse: MACHINE, simulated, behind "
+              "the map of a drive family, or with --eds alone.")  # fmt: skip
 @click.option("--eds", metavar="FILE", help="Rehearse: MACHINE, simulated, behind the EDS or DCF of its drive.")
 @runs_option
 @click.option("--flux-map", is_flag=True, help="Measure the flux map, and design with it, whether the machine "
@@ -131,7 +132,9 @@ def commission_command(
     if rehearse is not None or eds is not None:
         if resume is not None:
             raise click.UsageError("--resume goes on with the drive of its run: not together with --rehearse or --eds")
-        bus = rehearsal_bus(bus, eds=eds, family=rehearse, machine=machine)
+        if rehearse == "" and eds is None:
+            raise click.UsageError("--rehearse needs the name of a drive family, or --eds FILE")
+        bus = rehearsal_bus(bus, eds=eds, family=rehearse or None, machine=machine)
         for line in assumptions_of(eds, load_machine_file(machine)) if eds is not None and machine is not None else ():
             out.warn(f"{eds}: {line}")
     if accept and motion.yes:

@@ -44,6 +44,7 @@ LONGEST_NAME = 256
 
 NOT_READ = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY)
 """Refusals to read an object that count as missing: what cannot be read back proves nothing."""
+OF_LENGTH = (AbortCode.LENGTH, AbortCode.TOO_LONG, AbortCode.TOO_SHORT)
 
 Watcher = Callable[[int, int], None]
 """Called with index and sub-index before an object is written."""
@@ -132,7 +133,7 @@ class DriveNode:
 
     def command(self, item: DriveObject, value: int, *, retry: Retry = Retry.REPEAT) -> None:
         """Write a command: nothing a restore would have to bring back."""
-        self.sdo.download(item.index, item.sub, item.encode(value), retry=retry)
+        self.sdo.download(item.index, item.sub, self.typed(item).encode(value), retry=retry)
 
     def write_bytes(self, index: int, sub: int, data: bytes, *, retry: Retry = Retry.READ_BACK) -> None:
         """Write the bytes of an object."""
@@ -214,8 +215,16 @@ class DriveNode:
         return state_of(self.whole(objects.STATUSWORD))
 
     def go(self, word: Command) -> None:
-        """Write a controlword; repeating one is harmless."""
-        self.command(objects.CONTROLWORD, word)
+        """Write a controlword; repeating one is harmless.
+
+        A drive that refuses its length is asked for the width in which it keeps it.
+        """
+        try:
+            self.command(objects.CONTROLWORD, word)
+        except SdoAbort as abort:
+            if abort.code not in OF_LENGTH or self.held(objects.CONTROLWORD) is None:
+                raise
+            self.command(objects.CONTROLWORD, word)
 
     def wait_for_state(
         self, reached: Callable[[State | None], bool], timeout_s: float = STATE_TIMEOUT_S

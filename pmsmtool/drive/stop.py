@@ -107,13 +107,13 @@ def disable(node: DriveNode) -> State:
 
 def ask_at_once(node: DriveNode) -> None:
     """Send the controlword of the quick stop without waiting for anything: each of several drives begins to brake."""
-    word = objects.CONTROLWORD
+    word = node.typed(objects.CONTROLWORD)
     node.sdo.post(word.index, word.sub, word.encode(Command.QUICK_STOP))
 
 
 def disable_at_once(node: DriveNode) -> None:
     """Send the controlword that removes the voltage, without waiting for anything."""
-    word = objects.CONTROLWORD
+    word = node.typed(objects.CONTROLWORD)
     node.sdo.post(word.index, word.sub, word.encode(Command.DISABLE_VOLTAGE))
 
 

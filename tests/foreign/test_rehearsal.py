@@ -91,7 +91,8 @@ def test_a_rehearsal_is_a_channel_of_the_simulated_bus(tmp_path: Path) -> None:
 def test_commission_rehearses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A drive that gives nothing: the chain says so before anything moves, as on a real one."""
     monkeypatch.chdir(tmp_path)
-    for option in (["--rehearse", "faulhaber"], ["--eds", str(write_eds(tmp_path / "x.eds", epos4(0x25)))]):
+    eds = ["--eds", str(write_eds(tmp_path / "x.eds", epos4(0x25)))]
+    for option in (["--rehearse", "faulhaber"], eds, ["--rehearse", *eds]):
         error = run("commission", *option, "--yes").exception
         assert isinstance(error, NotAvailable) and "identify: needs" in str(error) and "torque mode" in str(error)
     assert run("commission", "--eds", "x.eds", "--resume", "runs/1").exit_code == 2

@@ -140,6 +140,7 @@ def checked(tool: Tool, rows: tuple[Row, ...]) -> tuple[int, dict[str, str], str
 WIDTHS: tuple[Row, ...] = (
     (0x6071, 0, "I32", "rw", "0"), (0x6073, 0, "U32", "rw", "1000"), (0x6075, 0, "U16", "rw", ""),
     (0x6078, 0, "I32", "ro", ""), (0x6080, 0, "U16", "rw", ""), (0x6502, 0, "U16", "ro", "0x2D"),
+    (0x6040, 0, "U32", "rw", "0"), (0x6041, 0, "U32", "ro", "0"), (0x6060, 0, "U8", "rw", ""),
 )  # fmt: skip
 
 
