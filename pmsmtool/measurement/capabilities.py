@@ -306,7 +306,7 @@ _LEVELS = (
     (CapabilityLevel.FULL, (*_INJECT, "averages")),
     (CapabilityLevel.INJECT, _INJECT),
     (CapabilityLevel.RECORDER, _RECORD),
-    (CapabilityLevel.STANDARD, (*_BOUNDED, "push")),
+    (CapabilityLevel.STANDARD, (*_BOUNDED, "push", "position")),
 )
 
 

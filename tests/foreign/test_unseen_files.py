@@ -286,3 +286,12 @@ def test_a_ramp_that_was_never_set_up_is_lent_a_faster_one(tool: Tool) -> None:
     write_eds(Path("y.eds"), unknown("0x2D", *(row for row in loop if row[0] not in (0x6083, 0x6084))))
     code, _, said = tool("--sim", channel.replace("x.eds", "y.eds"), "--yes", "move", "--by", "20deg", "--json")
     assert "0x6083" not in said
+
+
+@pytest.mark.chain
+def test_a_position_of_unknown_unit_stands_in_no_chains_way(tool: Tool) -> None:
+    """Everything else of the standard level is there: the chain ended with exit 9 before its design."""
+    write_eds(Path("x.eds"), unknown(without=(0x608F,)))
+    assert json.loads(tool("caps", "--eds", "x.eds", "--json")[1])["level"] == "manual"
+    code, _, said = tool("--yes", "commission", str(machine_path("interior-2k2")), "--eds", "x.eds", "--json")
+    assert code == 10, said
