@@ -14,7 +14,7 @@ import numpy as np
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError
 from pmsmtool.experiments.signals import table
-from pmsmtool.experiments.vector_turn import RAMP_S, come_to_rest, lead_onto_vector, rising, turn_vector
+from pmsmtool.experiments.vector_turn import RAMP_S, TURN_S, come_to_rest, lead_onto_vector, rising, turn_vector
 from pmsmtool.trace import Trace
 from pmsmtool.units import RPM_PER_RAD_S
 
@@ -38,6 +38,8 @@ SLOWEST_STEP_S = 0.2
 ROW_S = 0.002
 """Time over which the encoder is averaged after every step."""
 LEAST_RAMP_STEPS = 4
+BACK_LEAST_S = 0.3
+"""Shortest turn back to a whole electrical turn; the usual time is that of half a turn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +140,7 @@ def rotate_vector(drive: Drive, plan: RotationPlan, *, start_rad: float = 0.0) -
     come_to_rest(drive)
     angle, backward = _run(drive, plan, angle, -plan.step_rad, len(forward))
     whole = 2.0 * math.pi * round(angle / (2.0 * math.pi))
-    turn_vector(drive, plan.i_a, angle, whole)
+    turn_vector(drive, plan.i_a, angle, whole, max(BACK_LEAST_S, TURN_S * abs(whole - angle) / math.pi))
     come_to_rest(drive)
     drive.command_current(0.0, 0.0, fixed_angle_rad=whole)
     return forward, backward

@@ -71,7 +71,7 @@ class SquarePlan:
     half_periods: tuple[int, ...] = (6, 9)
     samples: int = SHOT_SAMPLES
     bias_bandwidth_rad_s: float = BIAS_BANDWIDTH_RAD_S
-    lead_s: float = 0.3
+    lead_s: float = 0.1
     angle_rad: float = 0.0
 
 

@@ -391,7 +391,8 @@ class Measurement:
     def _encoder_counts(self, start_rad: float, end_rad: float) -> None:
         for share in TURN_SHARES:
             self.turn_share = share
-            trace = standstill.turn_and_look(self.drive, share * self.limits.I_test_apk, start_rad, end_rad)
+            current = share * self.limits.I_test_apk
+            trace = standstill.turn_and_look(self.drive, current, start_rad, end_rad, self._effort.turn_s)
             try:
                 check_encoder_counts(trace)
                 break

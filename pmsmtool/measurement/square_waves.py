@@ -15,7 +15,7 @@ from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import square_injection
-from pmsmtool.experiments.vector_turn import TURN_S, turn_vector
+from pmsmtool.experiments.vector_turn import turn_vector
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.trace import Trace
 
@@ -47,9 +47,11 @@ FURTHER_OFF_RAD = math.radians(9.0)
 FURTHER_TRIES, FURTHER_MOST_RAD = 5, math.radians(20.0)
 """Corrections of the vector that leads it there, and the largest of them."""
 FURTHER_TURN_S = 0.12
-"""Shortest turn of the vector; a quarter of a turn takes the usual time."""
-FURTHER_SAMPLES, FURTHER_LEAD_S = 512, 0.1
-"""Samples of a shot there, and its lead: the comparison needs a tenth of a percent of L, not the best that can be."""
+"""Shortest turn of the vector; a quarter of a turn takes the time of :data:`QUARTER_TURN_S`."""
+QUARTER_TURN_S = 0.35
+"""The usual time is that of 0.15 of the test current; on the bias a rotor swings 1.8 times as fast."""
+FURTHER_LEAD_S = 0.05
+"""Lead of a shot there, of a quarter of the samples: the comparison needs a tenth of a percent of L."""
 U_SHARE = 0.5
 """Largest injection amplitude, of the largest voltage."""
 
@@ -167,7 +169,7 @@ class SquareStage:
                     axis,
                     plan.half_periods[0],
                     ripple / plan.ripple_a * amplitude,
-                    min(self.samples, FURTHER_SAMPLES),
+                    max(self.samples // 4, whole_periods(plan.half_periods[0])),
                 )
                 self.keep(f"angle_{axis}_{k}", shot)
             target = at.angle_rad + 0.5 * math.pi
@@ -202,7 +204,7 @@ class SquareStage:
 
     def _turn(self, plan: square_injection.SquarePlan, start_rad: float, end_rad: float) -> None:
         """Turn the bias to an angle, and wait for it."""
-        turn_s = max(FURTHER_TURN_S, TURN_S * abs(end_rad - start_rad) / (0.5 * math.pi))
+        turn_s = max(FURTHER_TURN_S, QUARTER_TURN_S * abs(end_rad - start_rad) / (0.5 * math.pi))
         turn_vector(self.drive, plan.bias_d_a, start_rad, end_rad, turn_s)
         square_injection.hold_bias(self.drive, replace(plan, angle_rad=end_rad))
 
