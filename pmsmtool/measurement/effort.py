@@ -60,6 +60,7 @@ class SpeedEffort:
     shares: tuple[float, ...] = speed_run.SHARES
     d_shares: tuple[tuple[float, ...], ...] = speed_run.D_SHARES
     q_at: tuple[int, ...] = speed_run.Q_AT
+    window_s: float = speed_run.WINDOW_S
     push_samples: int = 1024
     mechanics_rows: int = mechanics_run.ROWS
 
@@ -81,13 +82,13 @@ class Effort:
 
 ALL = Effort()
 LEVEL_EFFORTS = (
-    LevelEffort((0.08, 0.16, 0.3, 0.42, 0.6, 0.8, 1.0), (0.03,), 400, 4.0 * standstill.DRIFTED, 0.03),
+    LevelEffort((0.12, 0.3, 0.42, 0.6, 0.8, 1.0), (0.04,), 400, 4.0 * standstill.DRIFTED, 0.03),
     LevelEffort((0.08, 0.12, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0), (0.02, 0.04), 800, 2.0 * standstill.DRIFTED),
     ALL_LEVELS,
 )
 SHOT_EFFORTS = (512, 1024, square_injection.SHOT_SAMPLES)
 SPEED_EFFORTS = (
-    SpeedEffort((0.42, 0.85), ((1.0, 1.0), (1.0 / 3.0, 2.0 / 3.0, 1.0)), (0,), push_samples=256, mechanics_rows=800),
+    SpeedEffort((0.42, 0.85), ((1.0, 1.0), (1.0 / 3.0, 2.0 / 3.0, 1.0)), (0,), 0.04, 256, 800),
     ALL_SPEEDS,
 )
 QUICK_TURN_S = 0.4

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -204,8 +204,9 @@ class SpeedStage:
         The current is the one that flowed: a slow loop, or a dead time, lets it rise late.
         """
         decimation = max(1, round(seconds / (256 * self.drive.period_s)))
-        push = self._push(i_q_a, 256, decimation, pole_pairs)
-        self._push(-i_q_a, 256, decimation, pole_pairs)
+        push, _ = (
+            self._push(sign * i_q_a, 256, decimation, pole_pairs, speed_run.SHORT_PUSH_SIGNALS) for sign in (1.0, -1.0)
+        )
         return abs(_change(push["omega_e_rad_s"]) / pole_pairs), abs(_change(self._gained(push)[1]))
 
     def _gained(self, push: Trace) -> tuple[Array, Array]:
@@ -222,9 +223,12 @@ class SpeedStage:
             shown[k] = second
         return gained, shown
 
-    def _push(self, i_q_a: float, samples: int, decimation: int, pole_pairs: int) -> Trace:
+    def _push(
+        self, i_q_a: float, samples: int, decimation: int, pole_pairs: int,
+        signals: Sequence[str] = speed_run.PUSH_SIGNALS,
+    ) -> Trace:  # fmt: skip
         omega_e = PUSH_END_SHARE * pole_pairs * self.limits.omega_max_rad_s
-        return speed_run.push_and_record(self.drive, i_q_a, samples, decimation, omega_e)
+        return speed_run.push_and_record(self.drive, i_q_a, samples, decimation, omega_e, signals)
 
     def _speeds(self, psi: float, J: float, pole_pairs: int, L: tuple[float, float], V_dead_v: float) -> SpeedPlan:
         limits = self.limits
@@ -270,6 +274,7 @@ class SpeedStage:
             i_q,
             settle_s=loop.settle_s,
             first_s=2.0 * loop.settle_s,
+            window_s=self.effort.window_s,
             per_ampere_rad_s2=per_ampere,
             acceleration_rad_s2=per_ampere * i_run,
             shares=self.effort.shares,
