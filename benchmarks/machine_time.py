@@ -7,8 +7,8 @@ Machine time is that of the bus clock from consent to the restored drive, all de
 median and largest time, errors, how often the total 95 % interval holds the truth, the statistical half widths, how
 often the accuracy was said to be reached, and the half width that was found over the one that was predicted.
 
-Of these 12 drives (block timing), seconds of machine time, relative errors and statistical 95 % half widths in percent,
-the largest of the drives; R at the temperature of the measurement:
+Of these 12 drives (block timing) at an earlier state, seconds of machine time, relative errors and statistical 95 %
+half widths in percent, the largest of the drives; R at the temperature of the measurement:
 
     asked     median  largest   error: R    L     psi    half width: R    L     psi   truth in total 95 %
     nothing    45.6    50.2        0.11   0.08   0.12           0.30   0.25   0.32    60 of 60
@@ -16,8 +16,8 @@ the largest of the drives; R at the temperature of the measurement:
     0.01       31.1    34.0        0.16   0.13   0.13           0.45   0.36   0.32    60 of 60
 
 Both shares get the least effort, which leaves twice the accuracy of 1 %. What is left is no matter of how much is
-collected. Of 29.4 s of ``interior-2k2``: dead-man and noise 1.5, phases and current limit 2.8, first turn 1.2,
-levels 4.3, pairs of phases 1.9, slow turn 4.3, square waves 2.7, pushes 2.0, speeds 6, mechanics 3.
+collected. Of 31.8 s of ``interior-2k2``: dead-man and noise 1.2, phases and current limit 3.2, first turn 0.9, levels
+5.4, pairs of phases 2.1, slow turn 4.2, square waves 4.3, pushes and speed limit 2.6, speeds 4.8, mechanics 2.9.
 """
 
 from __future__ import annotations

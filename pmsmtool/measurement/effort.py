@@ -82,7 +82,7 @@ class Effort:
 
 ALL = Effort()
 LEVEL_EFFORTS = (
-    LevelEffort((0.12, 0.3, 0.42, 0.6, 0.8, 1.0), (0.04,), 400, 4.0 * standstill.DRIFTED, 0.03),
+    LevelEffort((0.08, 0.16, 0.3, 0.42, 0.6, 0.8, 1.0), (0.03,), 400, 4.0 * standstill.DRIFTED, 0.03),
     LevelEffort((0.08, 0.12, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0), (0.02, 0.04), 800, 2.0 * standstill.DRIFTED),
     ALL_LEVELS,
 )

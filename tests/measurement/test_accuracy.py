@@ -33,10 +33,8 @@ from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace_file import read_trace
 
-ALL_OF_IT_S = 48.8
-"""Machine time of all default quantities of ``interior-2k2`` without an accuracy."""
-FASTER = 1.3
-"""Least ratio to that of 1 %; measured: 1.37."""
+MOST_S = 33.0
+"""Machine time of all default quantities of ``interior-2k2`` with 1 %; measured: 31.1 s, without an accuracy 46.5 s."""
 
 
 def identified(folder: Path, accuracy: float | None, said: list[str]) -> tuple[RunDirectory, Stage]:
@@ -98,7 +96,7 @@ def test_a_percent_takes_less_machine_time_and_the_truth_is_in_the_intervals(
     data = json.loads(out)
     (folder,) = tmp_path.iterdir()
     (stage,) = RunDirectory(folder).read().stages
-    assert stage.seconds < ALL_OF_IT_S / FASTER
+    assert stage.seconds < MOST_S
     drive = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
     truth = {key: getattr(drive.machine, key) for key in ("L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")}
     truth["R_s_ohm"] = true_loop_resistance(drive)
