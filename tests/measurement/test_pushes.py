@@ -78,13 +78,13 @@ class LateCurrent:
             omega[k] = self.omega
         self.fastest = max(self.fastest, float(np.max(np.abs(omega))))
         error = (4.0 / math.pi * V_DEAD - self.off_v) * np.sign(i_q)
-        signals: dict[str, Any] = {name: np.zeros(samples) for name in names}
-        signals |= {
+        signals: dict[str, Any] = {
             "i_q_a": i_q,
             "omega_e_rad_s": POLE_PAIRS * self.shown(omega, decimation * self.period_s),
             "u_q_v": PSI * POLE_PAIRS * omega + R * i_q + error,
         }
-        return Trace(t, signals, dict.fromkeys(names, "1"), {"period_s": decimation * self.period_s})
+        asked = {name: signals.get(name, np.zeros(samples)) for name in names}
+        return Trace(t, asked, dict.fromkeys(names, "1"), {"period_s": decimation * self.period_s})
 
 
 def pushed(
