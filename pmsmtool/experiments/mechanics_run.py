@@ -40,8 +40,7 @@ LEFT_LEAST = 0.5
 """Speed at the begin of a coasting, of that at the end of the push, below which most of it was over before."""
 CURRENT_OFF = 0.15
 """Current, of the push's, below which it is over. What flows then is known, and counts as a torque: a loop whose
-integral follows the falling back-EMF lets 8 % flow on a light shaft until friction has stopped it.
-"""
+integral follows the falling back-EMF lets 8 % flow on a light shaft until friction has stopped it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,47 +7,47 @@ import ctypes
 import textwrap
 from collections.abc import Iterable, Mapping
 from functools import cache
+from typing import NamedTuple
 
 from pmsmtool.firmware.core_binding import APPLICATION_HEADER, CORE_HEADERS, HEADER_FOLDER
 from pmsmtool.firmware.laws import LAWS, Law
 from pmsmtool.native import parse_structs
 
-CYCLES = {
-    "PI": (1590, 1611, 1677),
-    "PI, predictor": (1890, 1908, 1974),
-    "line search": (2887, 2977, 3358),
-    "exact, 12 rows": (4270, 5535, 8065),
-    "best": (3563, 5633, 7516),
-    "best, delay": (3694, 5617, 7606),
-    "best + accelerated FW": (3660, 6761, 8010),
-    "saturated: best + table": (5053, 7992, 11876),
-    "saturated: best + table, predictor": (5345, 7532, 11979),
-    "polar, proposed": (2620, 2664, 2699),
-    "polar, regularised": (2349, 2370, 2436),
-    "polar, unified": (2720, 2741, 3741),
+
+class Cost(NamedTuple):
+    """What a whole period of a law takes on a Cortex-M4F.
+
+    Attributes
+    ----------
+    mean, nominal, worst : int
+        Model cycles: mean and worst of a nominal run, worst of the adversarial search; rows of
+        ``benchmarks/core_cost.md``.
+    stack : int
+        Bytes of stack, as ``python benchmarks/core_cost.py --stack`` found them (clang, -O2).
+    """
+
+    mean: int
+    nominal: int
+    worst: int
+    stack: int
+
+
+COSTS = {
+    "PI": Cost(1590, 1611, 1677, 256),
+    "PI, predictor": Cost(1890, 1908, 1974, 256),
+    "line search": Cost(2887, 2977, 3358, 4532),
+    "exact, 12 rows": Cost(4270, 5535, 8065, 4776),
+    "best": Cost(3563, 5633, 7516, 4744),
+    "best, delay": Cost(3694, 5617, 7606, 4744),
+    "best + accelerated FW": Cost(3660, 6761, 8010, 4744),
+    "saturated: best + table": Cost(5053, 7992, 11876, 4744),
+    "saturated: best + table, predictor": Cost(5345, 7532, 11979, 4744),
+    "polar, proposed": Cost(2620, 2664, 2699, 424),
+    "polar, regularised": Cost(2349, 2370, 2436, 348),
+    "polar, unified": Cost(2720, 2741, 3741, 460),
 }
-"""Model cycles of a whole period on a Cortex-M4F: mean and worst of a nominal run, worst of the adversarial search.
-
-Rows of ``benchmarks/core_cost.md``; a test compares them.
-"""
-
-STACK = {
-    "PI": 256,
-    "PI, predictor": 256,
-    "line search": 4532,
-    "exact, 12 rows": 4776,
-    "best": 4744,
-    "best, delay": 4744,
-    "best + accelerated FW": 4744,
-    "saturated: best + table": 4744,
-    "saturated: best + table, predictor": 4744,
-    "polar, proposed": 424,
-    "polar, regularised": 348,
-    "polar, unified": 460,
-}
-"""Bytes of stack of a period, as ``python benchmarks/core_cost.py --stack`` found them (clang, -O2).
-
-The states drawn for the saturated law with predictor reach 2904 only; its code is that of the row above.
+"""By law. The states drawn for the saturated law with predictor reach 2904 bytes of stack only; its code is that of the
+row above.
 """
 
 PREDICTOR, GOVERNOR_PREDICTOR = 1 << 4, 1 << 1
@@ -188,7 +188,7 @@ def structure_bytes() -> Mapping[str, int]:
 
 
 def counted_law(values: Mapping[str, float]) -> str:
-    """Return the row of ``CYCLES`` that is nearest to a set of catalogue values."""
+    """Return the row of ``COSTS`` that is nearest to a set of catalogue values."""
     polar, governor = int(values["polar.mode"]), int(values["governor.mode"])
     if polar > 0:
         return "polar, unified" if polar == UNIFIED else "polar, regularised" if polar >= LINEAR else "polar, proposed"
@@ -212,7 +212,7 @@ CLOCK_HZ = 170e6
 
 def period_share(values: Mapping[str, float]) -> float:
     """Return the share of a control period that the worst counted period of the nearest law takes at ``CLOCK_HZ``."""
-    return CYCLES[counted_law(values)][2] / (CLOCK_HZ * values["inverter.T_s_ns"] * 1e-9)
+    return COSTS[counted_law(values)].worst / (CLOCK_HZ * values["inverter.T_s_ns"] * 1e-9)
 
 
 APPLICATION_SOURCES = tuple(
@@ -249,7 +249,7 @@ def readme_text(values: Mapping[str, float], prefix: str, *, image_bytes: int, l
     kept = tuple(laws)
     gone = [f"{law.name} (`{law.mode}` above {law.last_without})" for law in LAWS if law not in kept]
     counted, T_s = counted_law(values), values["inverter.T_s_ns"] * 1e-9
-    mean, nominal, worst = CYCLES[counted]
+    taken = COSTS[counted]
     delay, shorted = values["inverter.delay_periods"], values["protection.n_short_circuit_rpm"]
     sizes = structure_bytes()
     reaction = "gates off"
@@ -260,8 +260,8 @@ def readme_text(values: Mapping[str, float], prefix: str, *, image_bytes: int, l
         compiled += f"Left out: {', '.join(gone)}; `pmsm_image_check` refuses a set that needs what is left out. "
     compiled += "Two motors share one core: export both with `--all-laws` and two prefixes, compile `pmsm_*` once."
     cost = (
-        f"A whole period of `{counted}`, of the counted laws the nearest to this set, takes {mean} cycles on average, "
-        f"{nominal} at worst in a nominal run, and {worst} at worst on adversarial inputs: "
+        f"A whole period of `{counted}`, of the counted laws the nearest to this set, takes {taken.mean} cycles on "
+        f"average, {taken.nominal} at worst in a nominal run, and {taken.worst} at worst on adversarial inputs: "
         f"{100.0 * period_share(values):.0f} % of {T_s * 1e6:.2f} us at 170 MHz. Cortex-M4F, instructions counted "
         "under emulation and weighted by a model: no flash wait states, no interrupt entry, not silicon."
     )
@@ -276,7 +276,7 @@ def readme_text(values: Mapping[str, float], prefix: str, *, image_bytes: int, l
         application_bytes=sizes["application"],
         application=textwrap.fill(_APPLICATION + ", ".join(f"`{name}`" for name in APPLICATION_SOURCES) + ".", WIDTH),
         signals=sizes["measurement"] + sizes["reference"] + sizes["output"],
-        stack=STACK[counted],
+        stack=taken.stack,
         image=image_bytes,
         misra="\n".join(f"- {rule}: {what} ({places})" for rule, (places, what) in MISRA.items()),
     )

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.firmware.export_c import FLAGS, c_files, not_read_by_core
-from pmsmtool.firmware.export_readme import CYCLES, STACK, counted_law, period_share, structure_bytes
+from pmsmtool.firmware.export_readme import COSTS, counted_law, period_share, structure_bytes
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.firmware.laws import LAWS, laws_in_use
 from pmsmtool.params.catalogue import CATALOGUE
@@ -136,11 +136,10 @@ def test_what_the_kept_laws_do_not_read_is_said() -> None:
 
 def test_the_page_states_the_numbers_that_were_measured() -> None:
     table = (Path(__file__).resolve().parents[2] / "benchmarks" / "core_cost.md").read_text(encoding="ascii")
-    for law, cycles in CYCLES.items():
+    for law, cost in COSTS.items():
         cells = next(line for line in table.splitlines() if line.startswith(f"| {law} |")).split("|")
         counted = [int(cell.split("(")[1].split(")")[0]) for cell in cells[2:6]]
-        assert (counted[0], counted[1], counted[3]) == cycles, law
-    assert STACK.keys() == CYCLES.keys()
+        assert (counted[0], counted[1], counted[3]) == cost[:3], law
 
 
 @pytest.mark.parametrize(
@@ -160,8 +159,8 @@ def test_the_page_states_the_numbers_that_were_measured() -> None:
 def test_the_page_takes_the_counted_law_of_the_set(changes: dict[str, float], law: str) -> None:
     assert counted_law(values(changes)) == law
     page = exported(changes)["README.md"]
-    assert f"`{law}`" in " ".join(page.split()) and f"{CYCLES[law][2]} at worst" in " ".join(page.split())
-    assert f"most found | {STACK[law]} |" in page and f"each motor | {structure_bytes()['state']} |" in page
+    assert f"`{law}`" in " ".join(page.split()) and f"{COSTS[law].worst} at worst" in " ".join(page.split())
+    assert f"most found | {COSTS[law].stack} |" in page and f"each motor | {structure_bytes()['state']} |" in page
     assert "{" not in page and "@" not in page and max(map(len, page.splitlines())) <= 130
 
 
