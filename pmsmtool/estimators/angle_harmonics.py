@@ -2,8 +2,9 @@
 """What repeats with the angle of the shaft, from coasting with the voltage off: cogging torque and encoder error.
 
 On a shaft that coasts with the speed w a torque T cos(n theta) moves the position by -T cos(n theta)/(J (n w)^2), an
-error of the encoder by itself, whatever the speed. Once and twice per turn count as the encoder's, higher orders as
-torque. Position minus a polynomial of time is regressed on one order after the other, both directions together, the
+error of the encoder by itself, whatever the speed. Once and twice per turn count as the encoder's, or as friction over
+the angle where it is the other way round in the other direction, which hides cogging but is none; higher orders count
+as torque. Position minus a polynomial of time is regressed on one order after the other, both directions together, the
 largest first (orthogonal matching pursuit; Pati et al., Asilomar 1993, DOI 10.1109/ACSSC.1993.342465), and an order
 stays while it stands out of what is left. Rows count by their deviation: after 27 turns binary32 rounds to 10 steps of
 22 bits, where the shaft is slow and shows a torque best, and an order 270 stood out that a smooth shaft does not have.
@@ -22,6 +23,9 @@ from pmsmtool.arrays import Array
 
 ENCODER_ORDERS = (1, 2)
 """Orders that are the encoder's: mounted off centre, and oval."""
+ENCODER, FRICTION, TORQUE = "encoder", "friction", "torque"
+"""What an order is: an error of the position, a torque that changes its sign with the direction, or one that does not.
+"""
 HIGHEST_ORDER = 400
 """Highest order per turn that is looked for: least common multiples of slots and poles lie below."""
 ORDERS_MOST = 8
@@ -120,22 +124,28 @@ def angle_harmonics(coastings: Sequence[tuple[Array, Array, Array]]) -> AngleHar
     left = np.concatenate([_without(basis, theta / std) for basis, (_, theta, std) in zip(bases, parts, strict=True)])
     lowest = math.ceil(DEGREE / turns)  # slower ones are the polynomial's
 
-    def pair(order: int) -> Array:
+    def pair(order: int, of: str) -> Array:
         rows = []
         for (angle, speed, std), basis in zip(smooth, bases, strict=True):
-            size = (1.0 if order in ENCODER_ORDERS else -1.0 / (order * speed) ** 2) / std
+            size = (1.0 if of == ENCODER else -1.0 / (order * speed) ** 2) / std
+            size = size * np.sign(speed) if of == FRICTION else size
             rows.append(np.stack([_without(basis, size * wave(order * angle)) for wave in (np.cos, np.sin)], axis=1))
         return np.concatenate(rows)
 
-    pairs = {order: pair(order) for order in range(max(1, lowest), HIGHEST_ORDER + 1)}
-    unit = {order: np.linalg.qr(columns)[0] for order, columns in pairs.items()}
-    chosen: list[int] = []
+    looked_for = [
+        (order, ENCODER if order in ENCODER_ORDERS else TORQUE) for order in range(max(1, lowest), HIGHEST_ORDER + 1)
+    ]
+    if len(parts) > 1:  # one direction alone does not tell it from an error of the encoder
+        looked_for += [(order, FRICTION) for order in ENCODER_ORDERS if order >= lowest]
+    pairs = {what: pair(*what) for what in looked_for}
+    unit = {what: np.linalg.qr(columns)[0] for what, columns in pairs.items()}
+    chosen: list[tuple[int, str]] = []
     fit, std = np.empty(0), np.empty(0)
     rest = left
     while len(chosen) < ORDERS_MOST:
-        power = {order: float(np.sum((rest @ unit[order]) ** 2)) for order in pairs if order not in chosen}
-        best = max(power, key=lambda order: power[order])
-        matrix = np.concatenate([pairs[order] for order in (*chosen, best)], axis=1)
+        power = {what: float(np.sum((rest @ unit[what]) ** 2)) for what in pairs if what not in chosen}
+        best = max(power, key=lambda what: power[what])
+        matrix = np.concatenate([pairs[what] for what in (*chosen, best)], axis=1)
         scale = np.linalg.norm(matrix, axis=0)
         found = np.linalg.lstsq(matrix / scale, left, rcond=None)[0] / scale
         after = left - matrix @ found
@@ -145,15 +155,16 @@ def angle_harmonics(coastings: Sequence[tuple[Array, Array, Array]]) -> AngleHar
         if math.hypot(*found[-2:]) < SURE * max(deviation[-2:]):
             break
         chosen, fit, std, rest = [*chosen, best], found, deviation, after
-    harmonics = [
-        Harmonic(order, float(fit[2 * k]), float(fit[2 * k + 1]), float(max(std[2 * k : 2 * k + 2])))
-        for k, order in enumerate(chosen)
-    ]
-    return AngleHarmonics(
-        tuple(sorted((h for h in harmonics if h.order in ENCODER_ORDERS), key=lambda h: h.order)),
-        tuple(sorted((h for h in harmonics if h.order not in ENCODER_ORDERS), key=lambda h: h.order)),
-        turns,
-    )
+
+    def found_of(wanted: str) -> tuple[Harmonic, ...]:
+        harmonics = [
+            Harmonic(order, float(fit[2 * k]), float(fit[2 * k + 1]), float(max(std[2 * k : 2 * k + 2])))
+            for k, (order, of) in enumerate(chosen)
+            if of == wanted
+        ]
+        return tuple(sorted(harmonics, key=lambda h: h.order))
+
+    return AngleHarmonics(found_of(ENCODER), found_of(TORQUE), turns)
 
 
 def _without(basis: Array, values: Array) -> Array:
