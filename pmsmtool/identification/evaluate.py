@@ -422,12 +422,16 @@ def inductance_of(
     assert result.resistance is not None and result.encoder is not None
     pole_pairs = round(result.encoder.pole_pairs.value)
     shots = {axis: shots_of(traces, axis, pole_pairs) for axis in "dq"}
-    further = {axis: shots_of(traces, axis, pole_pairs, "angle") for axis in "dq"}
+    further = {axis: [(shot, 0.0) for shot in shots_of(traces, axis, pole_pairs, "angle")] for axis in "dq"}
     offset = result.offset
     frame = None
     if offset is not None and result.flux is not None:
         ahead = {axis: _frame_ahead(shots[axis], result.encoder, offset.value) for axis in "dq"}
         frame = FrameAhead(ahead["d"], ahead["q"], max(offset.std, 1e-6))
+        further = {
+            axis: [(shot, _frame_ahead([shot], result.encoder, offset.value)) for shot, _ in there]
+            for axis, there in further.items()
+        }
     return estimate_inductances(
         shots["d"],
         shots["q"],

@@ -44,3 +44,19 @@ def test_the_mean_over_the_angle_and_how_far_it_goes(first_rad: float) -> None:
     even = [shot(L * harmonic(0.0), 6, k) for k in (3, 4)]
     assert over_angle(fit, here, even, at[1:]) == AngleDependence(1.0, 0.0)
     assert over_angle(fit, here, even[:1], at[1:2]) is None  # a sixth harmonic may have one value at two angles
+
+
+def test_angles_of_one_phase_of_the_sixth_harmonic_say_nothing_of_it() -> None:
+    """Cogging of two periods per pole pair held a rotor at 0, 4 and 114 deg: L_d 5 % off, at +-1.6 %."""
+    here, *others = (shot(L, 6, k) for k in range(3))
+    fit = fit_axis([here, shot(L, 9, 9)], NOISE, R, torque=False)
+    assert over_angle(fit, here, others, [0.1, 0.1 + math.radians(110.0)]) is None
+
+
+def test_what_the_frame_sees_of_the_other_axis_is_no_change_over_the_angle() -> None:
+    here, *others = (shot(L * more, 6, k) for k, more in enumerate((1.0, 1.01, 1.02)))
+    fit = fit_axis([here, shot(L, 9, 9)], NOISE, R, torque=False)
+    angles = [0.1, 0.1 + 0.5 * math.pi]
+    seen = over_angle(fit, here, others, angles)
+    assert seen is not None and seen.spread > UNEVEN
+    assert over_angle(fit, here, others, angles, [math.log(1.01), math.log(1.02)]) == AngleDependence(1.0, 0.0)

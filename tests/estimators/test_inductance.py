@@ -199,6 +199,35 @@ def test_each_axis_is_unmixed_with_the_angle_of_its_own_shots(plain: Shots) -> N
     assert result.L_q.i_q_apk == pytest.approx(mean * math.sin(-0.2), rel=0.02)
 
 
+def test_the_mean_over_the_angle_counts_where_the_rotor_stood(plain: Shots) -> None:
+    """Cogging turns it away from the frame: its own angles count, and what the frame sees of the other axis."""
+    d = plain.drives
+    k = int(np.argmax(d.L_q / d.L_d))
+    away = Shots(replace(d, offset=d.offset + 0.2), np.random.default_rng(3))
+    mixing = 1.0 / (1.0 - math.sin(d.offset[k] + 0.2) ** 2 * (1.0 - d.L_d[k] / d.L_q[k]))
+    assert mixing > 1.01  # measured 1.03
+
+    def result(rotor_rad: tuple[float, float], ahead: float) -> InductanceResult:
+        def further(axis: str, rotor: float) -> tuple[Trace, float]:
+            record = away.trace(k, axis, HALF_PERIODS[0])
+            return replace(record, meta={**record.meta, "fixed_angle_rad": rotor + ahead}), ahead
+
+        return estimate_inductances(
+            [plain.trace(k, "d", half) for half in HALF_PERIODS],
+            [plain.trace(k, "q", half) for half in HALF_PERIODS],
+            Noise(d.sigma_dq[k], 0.0, 0.0),
+            d.R[k],
+            frame=_ahead(d, k),
+            further={axis: [further(axis, rotor) for rotor in rotor_rad] for axis in "dq"},
+        )
+
+    quarter, beside = (0.2, 0.2 + 0.5 * math.pi), (0.2, 0.2 + math.radians(120.0))
+    even = result(quarter, d.offset[k] + 0.2).L_d
+    assert even.systematic == pytest.approx(even.value * math.hypot(0.01, 0.01)) and not even.fallback
+    assert "changes by" in result(quarter, d.offset[k]).L_d.fallback
+    assert "one angle" in result(beside, d.offset[k] + 0.2).L_d.fallback
+
+
 def test_the_bias_is_turned_into_the_rotors_frame() -> None:
     """A current along the rotor's d axis, as a frame ahead of it by 0.3 rad shows it."""
     shown = 4.0 * np.exp(-0.3j) * np.array([0.9, 1.1])

@@ -53,11 +53,11 @@ class AngleDependence:
 
 
 def over_angle(
-    fit: AxisFit, first: Shot, others: Sequence[Shot], angles_rad: Sequence[float]
+    fit: AxisFit, first: Shot, others: Sequence[Shot], angles_rad: Sequence[float], mixed: Sequence[float] = ()
 ) -> AngleDependence | None:
-    """Return how an inductance depends on the angle; None where one more angle shows no change.
+    """Return how an inductance depends on the angle; None where angles no quarter of a turn apart show no change.
 
-    A harmonic may have one value at both.
+    A harmonic may have one value at all of them.
 
     Parameters
     ----------
@@ -68,16 +68,19 @@ def over_angle(
     others : sequence of Shot
         At further angles, with the half period of ``first``.
     angles_rad : sequence of float
-        Electrical angles of these.
+        Electrical angles of the rotor during these.
+    mixed : sequence of float, optional
+        Logarithms of what these see more of L, because the frame stood otherwise to the rotor than at ``first``.
     """
     here = _log_inductance(fit, first)
     ratios = [_log_inductance(fit, shot) - here for shot in others]
+    ratios = [ratio - more for ratio, more in zip(ratios, mixed or [0.0] * len(ratios), strict=True)]
     off = [abs(abs(math.remainder(angle - angles_rad[0], math.pi)) - 0.5 * math.pi) for angle in angles_rad[1:]]
     quarter = len(off) == 1 and off[0] <= QUARTER_OFF_RAD
     mean = sum(ratios) / len(ratios) if quarter else 0.0
     spread = max(abs(ratio - mean) for ratio in (0.0, *ratios))
     if not spread > UNEVEN:
-        return AngleDependence(1.0, 0.0) if len(others) > 1 else None
+        return AngleDependence(1.0, 0.0) if quarter else None
     if quarter:
         return AngleDependence(math.exp(mean), spread * (1.0 + math.sin(3.0 * off[0])))
     return AngleDependence(1.0, max(UNSEEN * spread, UNSEEN_RANGE))

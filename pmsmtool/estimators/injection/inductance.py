@@ -74,6 +74,8 @@ ONE_ANGLE = (
     "at one angle of the rotor: that unequal phases and slots change it over the angle by "
     f"{100.0 * UNSEEN_RANGE:.2g} % is assumed"
 )
+FRAME_LIMIT_RAD = math.radians(30.0)
+"""Angle of the frame off the d axis beyond which the axes are not separated: at 45 deg they cannot be."""
 ANISOTROPY_LIMIT = 0.03
 """(1/L_d - 1/L_q) over the mean below which the axis angle cannot be told from the inductances."""
 
@@ -148,7 +150,7 @@ def estimate_inductances(
     instant: ShownInstant | None = None,
     U_dc_v: float = math.inf,
     tolerance: SensorTolerance | None = None,
-    further: Mapping[str, Sequence[Trace]] | None = None,
+    further: Mapping[str, Sequence[tuple[Trace, float]]] | None = None,
 ) -> InductanceResult:
     """Incremental inductances from square-wave shots.
 
@@ -175,8 +177,9 @@ def estimate_inductances(
         DC link (V): height of the bridge's pulses; infinite: the mean voltage is taken for all of a period.
     tolerance : SensorTolerance
         Declared sensor tolerances.
-    further : mapping of str to sequence of Trace, optional
-        Shots at two more angles of the rotor by axis, with the shortest half period: L is then the mean over the angle.
+    further : mapping of str to sequence of (Trace, float), optional
+        Shots at two more angles of the rotor by axis, with the shortest half period, and the angle of the frame ahead
+        of the rotor's d axis during each (rad electrical): L is then the mean over the angle.
 
     Raises
     ------
@@ -214,8 +217,8 @@ def estimate_inductances(
             frame, fallback = FrameAhead(angle, angle, angle_std), "frame offset from the cross responses"
         else:
             frame, fallback = FrameAhead(0.0, 0.0, 0.0), "frame offset unknown, machine nearly round: axes as they are"
-    uneven = _over_angle(fits, shots, further or {}, inverter, U_dc_v)
     values, stds = _unmix(fits, {axis: factor for axis, (_, factor, _) in widen.items()}, frame)
+    uneven = _over_angle(fits, shots, further or {}, inverter, U_dc_v, frame, values)
     biases = {"d": _bias(d_shots, frame.d_rad), "q": _bias(q_shots, frame.q_rad)}
     dependent = tuple(
         axis
@@ -277,20 +280,32 @@ def estimate_inductances(
 def _over_angle(
     fits: Mapping[str, AxisFit],
     shots: Mapping[str, Sequence[Shot]],
-    further: Mapping[str, Sequence[Trace]],
+    further: Mapping[str, Sequence[tuple[Trace, float]]],
     inverter: InverterCurve | None,
     U_dc_v: float,
+    frame: FrameAhead,
+    L_h: Mapping[str, float],
 ) -> dict[str, AngleDependence]:
-    """Return by axis how its inductance depends on the angle of the rotor, where that was measured."""
+    """Return by axis how its inductance depends on the angle of the rotor, where that was measured.
+
+    What counts is where the rotor stood: cogging and bias turn it away from the frame, which then sees a part of the
+    other axis, of the inductances ``L_h``.
+    """
     found = {}
     for axis, records in further.items():
         stage = f"inductance over the angle, {axis} axis"
+        if any(abs(ahead) > FRAME_LIMIT_RAD for _, ahead in records):
+            continue
         try:
-            others = [_shot(record, axis, inverter, U_dc_v, stage) for record in records]
+            others = [_shot(record, axis, inverter, U_dc_v, stage) for record, _ in records]
         except IdentificationError:
             continue  # a rotor that moved there, or a limited voltage: L is that of its own angle
-        angles = [record.meta["fixed_angle_rad"] for record in records]
-        if others and (at := over_angle(fits[axis], shots[axis][0], others, angles)):
+        inverse = {name: 1.0 / L for name, L in L_h.items()}
+        across = inverse["q" if axis == "d" else "d"] / inverse[axis] - 1.0
+        aheads = [frame.d_rad if axis == "d" else frame.q_rad, *(ahead for _, ahead in records)]
+        here, *mixed = (-math.log1p(across * math.sin(ahead) ** 2) for ahead in aheads)
+        angles = [float(record.meta["fixed_angle_rad"]) - ahead for record, ahead in records]
+        if others and (at := over_angle(fits[axis], shots[axis][0], others, angles, [there - here for there in mixed])):
             found[axis] = at
     return found
 
@@ -490,7 +505,7 @@ def _unmix(
         return determinant / ((1.0 - s_q) * g_d - s_d * g_q), determinant / ((1.0 - s_d) * g_q - s_q * g_d)
 
     eps = max(frame.d_rad, frame.q_rad, key=abs)
-    if abs(eps) > math.radians(30.0):
+    if abs(eps) > FRAME_LIMIT_RAD:
         raise refuse(
             "E_NOT_IDENTIFIABLE",
             f"the frame is {math.degrees(eps):.3g} deg off the d axis: L_d and L_q cannot be separated",
