@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
@@ -160,6 +161,30 @@ def test_the_pulses_of_identify_show_a_missing_current_and_a_wrong_sign(seed: in
     assert pulsed(0.97, 1.0, 2e-3, seed) == pulsed(0.71, 1.0, 2e-3, seed) == []
     assert pulsed(0.97, -1.0, 2e-3, seed) == [("encoder sign", WRONG)]
     assert pulsed(0.21, 1.0, 2e-3, seed) == [("phases", WRONG)]
+
+
+def pulses_of(shown: Callable[[float, float, float], float], top: float = 1e9) -> list[str]:
+    """What is wrong by twelve pulses of 1 kHz whose share of the command depends on time, angle and speed."""
+    pulses, theta, omega = [], 0.0, 0.0
+    for sign, seconds in ((1.0, 0.04), (-1.0, 0.08), (1.0, 0.08), (-1.0, 0.04)) * 3:
+        t = np.arange(0.0, seconds, 1e-3)
+        speed = np.clip(omega + sign * 1000.0 * t, -top, top)
+        angle = theta + np.cumsum(speed) * 1e-3
+        share = np.array([shown(at, where, fast) for at, where, fast in zip(t, angle, speed / top, strict=True)])
+        signals = {"theta_M_rad": angle, "i_q_a": sign * share}
+        pulses.append(Trace(t, signals, dict.fromkeys(signals, ""), {"i_command_a": sign}))
+        theta, omega = float(angle[-1]), float(speed[-1])
+    return [row.looked_at for row in judge_pulses(pulses) if row.looked_at == "phases"]
+
+
+def test_a_current_that_comes_late_or_ends_at_the_voltage_is_no_open_phase() -> None:
+    """A dead time of 4.5 V kept a current away for 40 to 65 ms; another one ended at the top of every pulse."""
+    late = pulses_of(lambda t, angle, fast: 0.02 if t < 0.06 else 0.3 + 20.0 * (t - 0.06))
+    assert late == []
+    assert pulses_of(lambda t, angle, fast: 0.11 if abs(fast) > 0.9 else 0.95, top=20.0) == []
+    assert pulses_of(lambda t, angle, fast: 0.02 if t < 0.06 else 0.1) == ["phases"]  # it never comes
+    assert pulses_of(lambda t, angle, fast: abs(np.sin(angle)) ** 3) == ["phases"]  # it breaks in at some angles
+    assert pulses_of(lambda t, angle, fast: abs(np.sin(angle)) ** 3, top=20.0) == ["phases"]
 
 
 @pytest.mark.chain
