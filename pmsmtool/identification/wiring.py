@@ -44,8 +44,8 @@ rms makes 0.71, and a slow current loop is not at its end.)"""
 LEAST_SAMPLES = 8
 """Of a torque pulse whose bend is looked at."""
 TOP_SHARE = 0.8
-"""Speed, of the fastest of all pulses, from which on the DC link may take the current away: on a motor of the population
-a tenth of it was left at 0.94 to 1.0 of the top, all of it at 0.9."""
+"""Speed, of the fastest of all pulses, from which on the DC link may take the current away: on a motor of the
+population a tenth of it was left at 0.94 to 1.0 of the top, all of it at 0.9."""
 NOT_LED = "the vector does not lead the rotor"
 HALLS_BY = "Hall wires of the connector; two motor leads swapped, if the encoder's sign is wrong, too"
 HALLS_SET = "the wires, or hall.axis_1_rad and so on: `pmsmtool identify hall` finds them"

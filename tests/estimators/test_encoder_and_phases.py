@@ -219,6 +219,19 @@ def test_unequal_phases_give_the_mean_of_them() -> None:
     assert over_phases(levels, alike, SensorTolerance()) is levels
 
 
+def test_what_the_noise_of_a_mean_voltage_makes_is_no_unequal_phase() -> None:
+    """Random drive 520004: 4.6 standard deviations of the currents' noise alone, and its phases are alike."""
+    noise = Noise(0.01, 0.0, 0.0)
+    alone = 2.0 * noise.sigma_a * math.sqrt(2.0 / 512.0)  # of a slope of 2 ohm, between 1 and 2 A
+
+    def off(times: float) -> tuple[float, float, float]:
+        beyond = times * alone
+        return check_pairs(pairs((2.0 + 2.0 * beyond, 2.0 - beyond, 2.0 - beyond)), noise, STEP).beyond_mean_ohm
+
+    assert off(4.6) == (0.0, 0.0, 0.0)
+    assert max(map(abs, off(6.5))) == pytest.approx(6.5 * alone, rel=0.05)
+
+
 @pytest.mark.parametrize(
     ("found", "reason"),
     [
