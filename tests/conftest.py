@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import ast
+import gc
 import os
 import signal
 import threading
@@ -48,6 +49,12 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PMSMTOOL_HOME", str(tmp_path_factory.mktemp("home")))
         yield
+
+
+def pytest_collection_finish() -> None:
+    """Leave what was imported and collected out of every later search for garbage: it took a tenth of the time."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -49,9 +49,9 @@ BUSY_RETRIES = 5
 
 @pytest.fixture
 def few_machines(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A proof predicted with a third of the machines the tool draws, where it is one of the stages."""
+    """A proof predicted with a sixth of the machines the tool draws, where it is one of the stages."""
     proof_within = commission.proof_within
-    monkeypatch.setattr(commission, "proof_within", lambda asked: replace(proof_within(asked), runs=32))
+    monkeypatch.setattr(commission, "proof_within", lambda asked: replace(proof_within(asked), runs=16))
 
 
 def the_run() -> tuple[RunDirectory, RunRecord]:

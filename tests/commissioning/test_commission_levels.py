@@ -51,7 +51,7 @@ PROFILE = data_folder("profiles") / "interior-2k2.toml"
 INJECT_OFF = 2e-3
 """Largest error of an identified value on the inject level, of R ten times that. Seven seeds of the drive's noise: L at
 most 0.09 %, psi_f 0.02 %, J 0.05 %, R 0.21 %."""
-FEW = ProofRequest(runs=32)
+FEW = ProofRequest(runs=16)
 """The proof's own tests run all of its experiments."""
 FOREIGN = [name for name in family_names() if name != "pmsmsim"]
 FILLED_IN = (0x1234, 0x5678)

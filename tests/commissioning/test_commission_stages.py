@@ -7,7 +7,7 @@ import shutil
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -46,7 +46,7 @@ from pmsmtool.sim.bus import PmsmSimBus
 pytestmark = pytest.mark.chain
 
 PROFILE = "interior-2k2"
-FEW_MACHINES = ProofRequest(runs=32)
+FEW_MACHINES = ProofRequest(runs=16)
 """The proof's own tests draw as many as the tool; here it is one of the stages."""
 SHARED = Shared()
 """Every chain here ends at the same design, and needs its prediction once."""
@@ -111,24 +111,36 @@ def drive(tmp_path: Path) -> Iterator[CanopenDrive]:
         yield found
 
 
+@dataclass(frozen=True)
+class Ended:
+    """A chain that has ended: folder of ``run`` and the drive's memory; frames, stages, consents, and what acts."""
+
+    folder: Path
+    frames: int
+    progress: Noted
+    person: Told
+    active_crc: int
+
+
 @pytest.fixture(scope="module")
-def ended_once(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
-    """Folder of a chain that has ended: ``run``, and the drive's memory; and the frames the chain took."""
+def ended_once(tmp_path_factory: pytest.TempPathFactory) -> Ended:
     folder = tmp_path_factory.mktemp("ended")
     with pytest.MonkeyPatch.context() as patch, drive_on(f"{PROFILE}?nv={folder / 'drive.nv'}") as drive:
         patch.setenv("PMSMTOOL_HOME", str(folder / "home"))
         patch.setattr(proof_stage, "predict_proof", SHARED.predict)
-        run = identified(folder, drive)
-        frames = _frames(run, drive, patch, None)
+        run, person = identified(folder, drive), Told()
+        frames, progress = _frames(run, drive, patch, None, person)
+        assert is_safe(drive.node.state())
+        crc = active_crc(drive)
     run.path.rename(folder / "run")
-    return folder, frames
+    return Ended(folder, frames, progress, person, crc)
 
 
 @pytest.fixture
-def ended(ended_once: tuple[Path, int], tmp_path: Path) -> Iterator[tuple[RunDirectory, CanopenDrive]]:
+def ended(ended_once: Ended, tmp_path: Path) -> Iterator[tuple[RunDirectory, CanopenDrive]]:
     """A copy of that chain, and a drive with its memory."""
-    shutil.copytree(ended_once[0] / "run", tmp_path / "run")
-    shutil.copy(ended_once[0] / "drive.nv", tmp_path / "drive.nv")
+    shutil.copytree(ended_once.folder / "run", tmp_path / "run")
+    shutil.copy(ended_once.folder / "drive.nv", tmp_path / "drive.nv")
     with drive_on(f"{PROFILE}?nv={tmp_path / 'drive.nv'}") as found:
         yield RunDirectory(tmp_path / "run"), found
 
@@ -157,14 +169,15 @@ def active_crc(drive: CanopenDrive) -> int:
     return DriveParameters(drive.node).crc_active
 
 
-def test_the_drive_holds_the_design_and_the_record_says_so(tmp_path: Path, drive: CanopenDrive) -> None:
-    run, person = identified(tmp_path, drive), Told()
-    progress = finish(run, drive, person)
+def test_the_drive_holds_the_design_and_the_record_says_so(
+    ended_once: Ended, ended: tuple[RunDirectory, CanopenDrive]
+) -> None:
+    (run, drive), person, progress = ended, ended_once.person, ended_once.progress
     assert progress.skipped == ["identify"]
     assert progress.ended == [(name, "pass") for name in STAGES[1:]]
     assert len(person.shown) == 1 and any("current.K_p_d_v_per_a" in line for line in person.shown[0])
     wanted = read_parameter_set(run.path / "params.toml")
-    assert active_crc(drive) == DriveParameters(drive.node).crc_stored == crc32(image_of(wanted))
+    assert ended_once.active_crc == DriveParameters(drive.node).crc_stored == crc32(image_of(wanted))
     record = run.read()
     assert all(record.passed(name) for name in STAGES)
     assert all(line.ok for stage in record.stages for line in stage.acceptance)
@@ -174,7 +187,6 @@ def test_the_drive_holds_the_design_and_the_record_says_so(tmp_path: Path, drive
     assert {name.rsplit("/", 1)[1] for name in proof} >= {"prediction.npz", "speed_step.npz", "q_steps.npz"}
     assert set(recorded) - proof == {"machine.toml", "design.toml", "lut.npz", "lut.csv", "params.toml"}
     assert len(person.moved) == 1 and any("speed step" in line for line in person.moved[0])
-    assert is_safe(drive.node.state())
     assert due_stages(run, record) == ()
     assert finish(run, drive, Told(writes=False)).skipped == list(STAGES)
 
@@ -278,10 +290,10 @@ def test_another_drive_is_refused(tmp_path: Path, drive: CanopenDrive) -> None:
 
 @pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
 def test_ctrl_c_in_the_middle_leaves_old_or_new_and_goes_on(
-    share: float, tmp_path: Path, ended_once: tuple[Path, int], monkeypatch: pytest.MonkeyPatch
+    share: float, tmp_path: Path, ended_once: Ended, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A signal while a frame is awaited, at a share of all the frames that the chain takes."""
-    total = ended_once[1]
+    total = ended_once.frames
     with drive_on(f"{PROFILE}?nv={tmp_path / 'second.nv'}") as second:
         run, crc = identified(tmp_path / "cut", second), active_crc(second)
         with pytest.raises(Interrupted) as caught:
@@ -294,7 +306,13 @@ def test_ctrl_c_in_the_middle_leaves_old_or_new_and_goes_on(
         finish(run, second)
 
 
-def _frames(run: RunDirectory, drive: CanopenDrive, monkeypatch: pytest.MonkeyPatch, stop_at: int | None) -> int:
+def _frames(
+    run: RunDirectory,
+    drive: CanopenDrive,
+    monkeypatch: pytest.MonkeyPatch,
+    stop_at: int | None,
+    person: Told | None = None,
+) -> tuple[int, Noted]:
     count = 0
     bus = drive.node.connection.bus
     send = bus.send
@@ -308,8 +326,8 @@ def _frames(run: RunDirectory, drive: CanopenDrive, monkeypatch: pytest.MonkeyPa
 
     with monkeypatch.context() as patch:
         patch.setattr(bus, "send", counted)
-        finish(run, drive)
-    return count
+        progress = finish(run, drive, person)
+    return count, progress
 
 
 def test_every_stage_has_a_step(tmp_path: Path, drive: CanopenDrive) -> None:

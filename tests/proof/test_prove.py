@@ -47,8 +47,8 @@ from pmsmtool.sim.kernel import Params
 
 pytestmark = pytest.mark.chain
 
-FEW = ProofRequest(runs=32)
-"""A third of the machines the tool draws."""
+FEW, FEWER = ProofRequest(runs=32), ProofRequest(runs=16)
+"""A third of the machines the tool draws; and a sixth, for a test that is alone with its prediction."""
 SHARED = Shared()
 """The design and the conditions are the same in every test, and so is their prediction: it is made once."""
 
@@ -98,10 +98,12 @@ def flashed(
         drive.close()
 
 
-def prove(drive: CanopenDrive, design: Design, said: list[str] | None = None) -> tuple[RunDirectory, Stage]:
+def prove(
+    drive: CanopenDrive, design: Design, said: list[str] | None = None, asked: ProofRequest = FEW
+) -> tuple[RunDirectory, Stage]:
     run = begin_run(drive, Path("runs"))
     lines = said if said is not None else []
-    stage = prove_stage(run, drive, design, FEW, lambda shown: None, lines.append)
+    stage = prove_stage(run, drive, design, asked, lambda shown: None, lines.append)
     run.add(stage)
     return run, stage
 
@@ -204,16 +206,14 @@ def test_what_identification_saw_is_in_the_band(known: dict[str, Value], setting
     )  # type: ignore[arg-type]
     design = tune(replace(source, conditions=known, inverter=inverter), TuneRequest(field_weakening="lookup"))
     with flashed(design, truth=replace(machine(), simulation={**machine().simulation, **settings})) as drive:
-        _, stage = prove(drive, design)
+        _, stage = prove(drive, design, asked=FEWER)
     assert stage.status == "pass", stage.note
 
 
 def test_a_healthy_drive_passes_within_a_small_current_limit(design: Design) -> None:
     """At full torque 5 A of the design's 12 A would all go into i_d, and the base speed would not be reached."""
-    few = replace(FEW, i_max_apk=5.0)
     with flashed(design) as drive:
-        run = begin_run(drive, Path("runs"))
-        stage = prove_stage(run, drive, design, few, lambda shown: None, lambda line: None)
+        run, stage = prove(drive, design, asked=replace(FEWER, i_max_apk=5.0))
     assert stage.status == "pass", stage.note
     (folder,) = (run.path / "prove").iterdir()
     prediction, traces = read_proof(folder)
@@ -229,14 +229,14 @@ def test_a_link_below_what_it_showed_at_rest_is_named(design: Design, monkeypatc
 
     monkeypatch.setattr(stages, "conditions_of", at_rest)
     with flashed(design) as drive:
-        _, stage = prove(drive, design)
+        _, stage = prove(drive, design, asked=FEWER)
     assert stage.status == "fail" and "likely the voltage is too low" in stage.note
 
 
 def test_what_a_sagging_link_decides_is_not_judged(design: Design) -> None:
     """A supply that falls by 5 % under load is a healthy one, and what it gives decides at the voltage limit."""
     with flashed(design, truth=replace(machine(), simulation={"U_dc_source_ohm": 6.0})) as drive:
-        _, stage = prove(drive, design)
+        _, stage = prove(drive, design, asked=FEWER)
     assert stage.status == "pass", stage.note
     left = [line for line in stage.fallbacks if "not judged: under load the DC link falls from 540 to" in line]
     assert left and not [line for line in stage.acceptance if line.what.startswith("unreachable")]
@@ -299,7 +299,7 @@ def test_a_heavy_shaft_is_given_the_time_it_needs() -> None:
     made = tune(heavy, TuneRequest())
     with flashed(made, truth=heavy) as drive:
         stage = prove_stage(
-            begin_run(drive, Path("runs")), drive, made, replace(FEW, experiments=("unreachable",)),
+            begin_run(drive, Path("runs")), drive, made, replace(FEWER, experiments=("unreachable",)),
             lambda shown: None, lambda line: None,
         )  # fmt: skip
         assert is_safe(drive.node.state())

@@ -35,7 +35,7 @@ from pmsmtool.run_directory import Stage
 
 pytestmark = pytest.mark.chain
 
-FEW = ProofRequest(runs=32)
+FEW = ProofRequest(runs=16)
 SHARE = 0.02
 """Standard deviation of the declared values, relative."""
 AT_REST = Conditions(540.0, 25.0, 25.0, 1 << 17, 20.0, 4500.0 * math.pi / 30.0)
