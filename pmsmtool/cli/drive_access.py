@@ -194,10 +194,10 @@ def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[C
             drive = CanopenDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
         except SdoAbort as abort:
             raise NotAvailable(
-                "this drive does not have the objects that experiments and commissioning need",
+                "this command needs set-points for d and q, and a recorder at loop rate, which this drive does not have",
                 where=abort.where,
-                likely="a drive of another family",
-                hint="`pmsmtool caps` lists what it can measure and what is missing",
+                likely="a drive with fixed firmware",
+                hint="`pmsmtool commission` runs every stage that this drive allows, `pmsmtool caps` lists what it has",
             ) from abort
         check_motion(drive.node.map, drive.identity)
         yield drive

@@ -105,7 +105,9 @@ def restore_command(
             text = f"{told(outcome, node)}: already as {same}, nothing was done"
             out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [text])
             if not outcome.stored:
-                out.warn("whether the drive keeps these values over a reset is not known; flash-params stores a set")
+                out.warn(
+                    "whether the drive keeps these values over a reset is not known: look again after its next reset"
+                )
             return
         keeps = not is_whole(snapshot) or node.has(*STORE_ALL)
         outcome = write_plan(
@@ -115,10 +117,10 @@ def restore_command(
         out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])
         missed = [f"not restored: {name}: {reason}" for name, reason in outcome.refused.items()]
         if not keeps:
-            missed.append("not stored: the drive has no 0x1010; it holds the values until its next reset")
+            missed.append("not stored: the drive cannot store all (0x1010:01); it holds them until its next reset")
         if missed:
             raise Partial(
-                f"{len(outcome.refused)} of {len(plan.entries)} objects were not taken, all others are as saved",
+                f"{len(plan.entries) - len(outcome.refused)} of {len(plan.entries)} objects are as saved",
                 where=f"node {node.node}",
                 missing=missed,
                 hint="compare firmware and product of both drives; set what is named by the maker's own tool",

@@ -206,4 +206,6 @@ def test_a_drive_that_cannot_store_says_so(tmp_path: Path, monkeypatch: pytest.M
         saved, _ = take_whole_backup(node, node.identity(), listed())
     (tmp_path / "drive.json").write_text(saved.dumps())
     error = tool("--sim", f"mtpv-test?nv=:memory:&eds={path}", "--yes", "restore", "drive.json", "--other-drive")
-    assert isinstance(error.exception, Partial) and "no 0x1010" in str(error.exception)
+    assert isinstance(error.exception, Partial) and "cannot store all (0x1010:01)" in str(error.exception)
+    count = len(saved.entries)
+    assert f"{count} of {count} objects are as saved" in str(error.exception)
