@@ -135,9 +135,7 @@ class CanopenDrive:
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero reference, in the identification mode."""
         stop.zero_references(self.node)
-        self._set_mode(Mode.IDENTIFICATION)
-        self.may_be_energised = True
-        self.node.enable()
+        self._energise(Mode.IDENTIFICATION)
 
     def disable(self) -> None:
         """Remove the voltage; returns when the statusword confirms it, else ``StopNotConfirmed``."""
@@ -168,6 +166,21 @@ class CanopenDrive:
         self.node.put(objects.TARGET_VELOCITY_MRPM, omega_m_rad_s / RAD_S_PER_MRPM)
         self._set_mode(Mode.PROFILE_VELOCITY)
 
+    def _energise(self, mode: int) -> None:
+        """Bring the drive to operation enabled in a mode of operation.
+
+        Raises
+        ------
+        NotAvailable
+            As :meth:`_set_mode`; in another mode than before it was enabled it is off again.
+        """
+        self._set_mode(mode)
+        self.may_be_energised = True
+        self.node.enable()
+        if (shown := self._shown_mode()) not in (None, mode):
+            self.disable()
+            raise self._other_mode(mode, shown, "once enabled, the drive changes to")
+
     def _set_mode(self, mode: int) -> None:
         """Ask for a mode of operation, and go on when the drive shows it (0x6061), or shows none at all.
 
@@ -190,14 +203,17 @@ class CanopenDrive:
         end = clock.now() + MODE_S
         while (shown := self._shown_mode()) not in (None, mode):
             if clock.now() >= end:
-                raise NotAvailable(
-                    f"the drive stays in mode of operation{_mode_name(shown)} ({shown}), though{_mode_name(mode)} "
-                    f"({int(mode)}) was asked for and taken", where=f"node {self.node.node}, 0x6061:00",
-                    likely="the mode needs an option of the drive, or another source of commands is set in it",
-                    hint="choose the source and the mode with the maker's tool; `pmsmtool caps` lists what this drive "
-                    "can measure",
-                )  # fmt: skip
+                raise self._other_mode(mode, shown, "the drive stays in")
             self.node.connection.wait(MODE_LOOK_S)
+
+    def _other_mode(self, mode: int, shown: int, does: str) -> NotAvailable:
+        return NotAvailable(
+            f"{does} mode of operation{_mode_name(shown)} ({shown}), though{_mode_name(mode)} "
+            f"({int(mode)}) was asked for and taken", where=f"node {self.node.node}, 0x6061:00",
+            likely="the mode needs an option of the drive, or another source of commands is set in it",
+            hint="choose the source and the mode with the maker's tool; `pmsmtool caps` lists what this drive "
+            "can measure",
+        )  # fmt: skip
 
     def _shown_mode(self) -> int | None:
         try:

@@ -96,9 +96,7 @@ class PositionDrive(TorqueDrive):
         """Bring the drive to operation enabled in its position mode, at the place where the shaft stands."""
         self._start_counts = self.node.get(POSITION)
         self.node.put(TARGET_POSITION, self._start_counts)
-        self._set_mode(Mode.PROFILE_POSITION)
-        self.may_be_energised = True
-        self.node.enable()
+        self._energise(Mode.PROFILE_POSITION)
 
     def move_to(self, angle_rad: float) -> None:
         """Start a move to an angle from where the shaft stood when it was enabled.

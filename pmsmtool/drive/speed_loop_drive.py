@@ -139,9 +139,7 @@ class SpeedLoopDrive(TorqueDrive):
     def enable(self) -> None:
         """Bring the drive to operation enabled at no speed, in its velocity mode."""
         self.node.put(objects.TARGET_VELOCITY_MRPM, 0)
-        self._set_mode(self.mode)
-        self.may_be_energised = True
-        self.node.enable()
+        self._energise(self.mode)
 
     def command_speed(self, omega_m_rad_s: float) -> None:
         """Ask for the nearest speed that whole counts give."""

@@ -130,9 +130,7 @@ class StandardDrive(CanopenDrive):
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero torque with the master's commutation angle."""
         self.node.put(objects.TARGET_TORQUE_PERMILLE, 0)
-        self._set_mode(Mode.CYCLIC_TORQUE_ANGLE)
-        self.may_be_energised = True
-        self.node.enable()
+        self._energise(Mode.CYCLIC_TORQUE_ANGLE)
 
     def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
         """Hold a current vector at a fixed electrical angle: torque current behind a commutation angle."""
@@ -201,9 +199,7 @@ class TorqueCurrent(CanopenDrive):
             self._step_s = max(STEP_S, cyclic_period_s(self.node, STEP_S))
         elif self.target.mode == Mode.PROFILE_TORQUE:
             quicken_slope(self.node)
-        self._set_mode(self.target.mode)
-        self.may_be_energised = True
-        self.node.enable()
+        self._energise(self.target.mode)
 
     def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
         """Ask for the torque of a q current."""

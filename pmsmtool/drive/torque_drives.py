@@ -123,9 +123,7 @@ class SpeedPushDrive(TorqueDrive):
     def enable(self) -> None:
         """Bring the drive to operation enabled at no speed and no current."""
         self.command_current(0.0, 0.0)
-        self._set_mode(self.push.mode)
-        self.may_be_energised = True
-        self.node.enable()
+        self._energise(self.push.mode)
 
     def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
         """Let the drive push with a q current towards the top speed."""
