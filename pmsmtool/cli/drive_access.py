@@ -194,7 +194,7 @@ def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[C
             drive = CanopenDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
         except SdoAbort as abort:
             raise NotAvailable(
-                "this command needs set-points for d and q, and a recorder at loop rate, which this drive does not have",
+                "this command needs set-points for d and q, and a recorder at loop rate: this drive lacks them",
                 where=abort.where,
                 likely="a drive with fixed firmware",
                 hint="`pmsmtool commission` runs every stage that this drive allows, `pmsmtool caps` lists what it has",
