@@ -206,7 +206,7 @@ class SdoChannel:
 
     @contextmanager
     def limited(self, *, silence_s: float, own_s: float, total_s: float) -> Iterator[None]:
-        """Inside, raise ``OutOfTime`` when no valid answer came for ``silence_s``, or after ``total_s``.
+        """Inside, raise ``OutOfTime`` when no transfer was answered whole for ``silence_s``, or after ``total_s``.
 
         Parameters
         ----------
@@ -263,7 +263,6 @@ class SdoChannel:
             if frame is not None and frame[0] == 0x80:
                 self.raise_if_abort_of(attempt, frame)
             elif frame is not None and accept(frame):
-                self._unanswered_s = None
                 self._answers.keep(frame, self.connection.clock.now())
                 return frame
             now = self.connection.clock.now()
@@ -507,6 +506,7 @@ class SdoChannel:
             self._check()
 
     def _result(self, attempt: Attempt, data: bytes, tries: int) -> Transfer:
+        self._unanswered_s = None  # not before: a server may begin every upload and end none
         self.retries += tries - 1
         if tries > 1:  # the answer to an earlier try may still come
             self._answers.forget(self.connection.clock.now())

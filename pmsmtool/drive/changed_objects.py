@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from pmsmtool.bus.abort_codes import BUSY_CODES
+from pmsmtool.bus.busy import is_busy, when_ready
 from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -14,8 +14,8 @@ _MARKS: tuple[_Object, ...] = tuple(
     (mark.index, mark.sub) for mark in (objects.CONFIGURATION_DATE, objects.CONFIGURATION_TIME)
 )
 """Cleared by every change of another object."""
-BUSY_S, BUSY_POLL_S = 5.0, 0.1
-"""A drive that refuses because it is busy is asked again for so long, and so often."""
+BUSY_S = 5.0
+"""A drive that refuses because it is busy is asked again for so long."""
 
 
 class ChangedObjects:
@@ -54,17 +54,9 @@ class ChangedObjects:
             The drive refuses it, for being busy longer than ``BUSY_S``.
         """
         self._node.before_write = None
-        clock = self._node.connection.clock
-        until = clock.now() + BUSY_S
         back: set[_Object] = set()
-        while True:
-            try:
-                self._bring_back(back)
-                return len(back)
-            except SdoAbort as abort:
-                if abort.code not in BUSY_CODES or clock.now() >= until:
-                    raise
-            self._node.connection.wait(BUSY_POLL_S)
+        when_ready(self._node.connection, lambda: self._bring_back(back), BUSY_S)
+        return len(back)
 
     def _bring_back(self, back: set[_Object]) -> None:
         drive_map = self._node.map
@@ -81,7 +73,7 @@ class ChangedObjects:
             except VerifyMismatch as mismatch:  # the limits must get their content all the same
                 lines += mismatch.differences
             except DriveFault as fault:
-                if isinstance(fault, SdoAbort) and fault.code in BUSY_CODES:
+                if is_busy(fault):
                     raise
                 lines += fault.what.splitlines()
         for (index, sub), data in reversed(others.items()):  # the marks, which were noted first, last
@@ -94,7 +86,7 @@ class ChangedObjects:
             except SdoAbort as abort:
                 if index == objects.MODE.index:
                     continue  # the mode a drive wakes up with, which some take from nobody; it is off by now
-                if abort.code in BUSY_CODES:
+                if is_busy(abort):
                     raise
                 lines.append(f"0x{index:04X}:{sub:02X}: {abort.what}")
         if lines:

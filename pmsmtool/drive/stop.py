@@ -7,7 +7,7 @@ import contextlib
 import math
 from collections.abc import Callable
 
-from pmsmtool.bus.abort_codes import BUSY_CODES
+from pmsmtool.bus.busy import when_ready
 from pmsmtool.bus.sdo import OutOfTime
 from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.cia402 import Command, QuickStop, State
@@ -38,8 +38,7 @@ FALLEN = 0.995
 STOP_TRIES = 4
 """A stop is asked for this often: each kind of alarm may end one attempt."""
 BUSY_S = 3.0
-"""A drive that refuses because it is busy is asked again for so long, every ``BUSY_POLL_S``."""
-BUSY_POLL_S = 0.05
+"""A drive that refuses because it is busy is asked again for so long."""
 STANDSTILL_MRPM = 5_000.0
 """Speed (thousandths of rpm) below which a drive that stays in quick stop counts as standing."""
 
@@ -63,26 +62,29 @@ def quick_stop(node: DriveNode, *, ramp: bool = True, say: Callable[[str], None]
     """
     failure: PmsmtoolError | None = None
     clock = node.connection.clock
-    busy_until, tries = clock.now() + BUSY_S, 0
+    busy_until = clock.now() + BUSY_S
+
+    def off_unheard() -> None:
+        with contextlib.suppress(BusError):
+            disable_at_once(node)
+
     with node.sdo.limited(silence_s=SILENCE_S, own_s=OWN_S, total_s=RAMP_LIMIT_S + ANSWERS_S):
-        while tries < STOP_TRIES:
-            tries += 1
+        for _ in range(STOP_TRIES):
             try:
                 with node.emergencies_tolerated(), node.supervision.other_masters_tolerated():
-                    return _stop_once(node, say, ramp=ramp)
+                    return when_ready(
+                        node.connection, lambda: _stop_once(node, say, ramp=ramp), busy_until - clock.now(),
+                        meanwhile=off_unheard,
+                    )  # fmt: skip
             except StopNotConfirmed:
                 raise
             except NodeReset as reset:
                 failure = reset  # a drive that boots is off; the next round confirms it
             except (BusError, DriveFault) as error:
                 failure = error
-                with contextlib.suppress(BusError):
-                    disable_at_once(node)
+                off_unheard()
                 if isinstance(error, OutOfTime):
                     break
-                if isinstance(error, SdoAbort) and error.code in BUSY_CODES and clock.now() < busy_until:
-                    tries = 0
-                    clock.wait(BUSY_POLL_S)
     raise not_confirmed(node, failure.what if failure else "no answer") from failure
 
 

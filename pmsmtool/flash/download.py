@@ -14,17 +14,16 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, auto
 
-from pmsmtool.bus.abort_codes import BUSY_CODES
+from pmsmtool.bus.busy import is_busy, when_ready
 from pmsmtool.bus.nmt import TOOL_NODE
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.drive import objects
-from pmsmtool.drive.drive_node import STORE_POLL_S, STORE_TIMEOUT_S, DriveNode
+from pmsmtool.drive.drive_node import STORE_TIMEOUT_S, DriveNode
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.parameters import Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import (
-    DriveFault,
     DriveTimeout,
     Interrupted,
     NotAvailable,
@@ -434,16 +433,8 @@ class Download:
 
     def _until_stored(self, work: Callable[[], None]) -> None:
         """Do something that a drive refuses while it still stores, again until it has finished."""
-        clock = self.node.connection.clock
-        until = clock.now() + (STORE_TIMEOUT_S if self.phase is Phase.STORING else 0.0)
-        while True:
-            try:
-                return work()
-            except DriveFault as fault:
-                busy = not isinstance(fault, SdoAbort) or fault.code in BUSY_CODES
-                if not busy or clock.now() >= until:
-                    raise
-                self.node.connection.wait(STORE_POLL_S)
+        within_s = STORE_TIMEOUT_S if self.phase is Phase.STORING else 0.0
+        when_ready(self.node.connection, work, within_s, busy=lambda f: is_busy(f) or not isinstance(f, SdoAbort))
 
     def _stored_crc(self) -> int | None:
         return self._parameters.crc_stored if self.node.map.staging else None

@@ -129,8 +129,8 @@ def _other_drive(drive_map: DriveMap, identity: Identity) -> ConfigError:
             where=_where(identity),
             likely="a drive whose gains stand in no shipped map",
             hint="enter the gains of design.toml with the maker's own tool, or write a map with the rows that its "
-            "manual documents and give it with --map; to copy a drive that is set up: `pmsmtool backup --eds FILE`, then "
-            "`pmsmtool restore --other-drive`; nothing was moved or written",
+            "manual documents and give it with --map; to copy a drive that is set up: `pmsmtool backup --eds FILE`, "
+            "then `pmsmtool restore --other-drive`; nothing was moved or written",
         )
     if identity.doubt:
         hint = "if it is one after all, give --map with a copy of the map whose [identity] names it"

@@ -210,6 +210,16 @@ def test_a_stop_without_a_valid_answer_ends_within_two_seconds(flood: bool) -> N
     assert words[-1] == 0, "the voltage is taken away unheard"
 
 
+def test_a_stop_whose_answers_begin_and_never_end_does_not_wait_for_them() -> None:
+    """Each segmented upload stalls after its first frame: 9.6 s passed before."""
+    bus, _ = opened(lambda request: [b"\x41" + request[1:4] + b"\x02\0\0\0"] if request[0] == 0x40 else [])
+    with pytest.raises(StopNotConfirmed):
+        quick_stop(DriveNode(Connection(bus), NODE))
+    assert 1.4 < bus.clock.now() < 2.2
+    words = [data[4] for cob, data in bus.sent if data[1:4] == b"\x40\x60\x00" and data[0] & 0xE0 == 0x20]
+    assert words[-1] == 0, "the voltage is taken away unheard"
+
+
 @pytest.mark.parametrize("greeting", [b"", b"<", b"< hi >", b"HTTP/1.1 400 Bad Request\r\n\r\n\x1b[2J"])
 def test_a_server_that_does_not_speak_socketcand_is_given_up(greeting: bytes) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
