@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Interrupted downloads: old or new, never mixed, and a way back or forward.
 
-Every 13th or 67th frame here; ``benchmarks/interrupted_downloads.py`` takes every frame.
+Every 23rd or 131st frame here; ``benchmarks/interrupted_downloads.py`` takes every frame.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from tests.flash.rig import SMALL, with_tables
 @pytest.mark.parametrize(
     ("wanted", "stride", "how"),
     [
-        *((SMALL, 13, how) for how in ("power cut", "killed", "ctrl-c")),
-        *((with_tables(), 67, how) for how in ("power cut", "killed")),
+        *((SMALL, 23, how) for how in ("power cut", "killed", "ctrl-c")),
+        *((with_tables(), 131, how) for how in ("power cut", "killed")),
     ],
 )
 def test_drive_holds_the_old_or_the_new_set(tmp_path: Path, wanted: ParameterSet, stride: int, how: How) -> None:
