@@ -57,7 +57,7 @@ def shown(value: pmsmtool.Trace | Design | pmsmtool.MachineFile | MarginReport |
 
 def test_a_design_shows_gains_with_units_and_margins(design: Design) -> None:
     text = shown(design)
-    assert text.startswith("design of interior-2k2: 97 values")
+    assert text.startswith("design of interior-2k2: 100 values")
     assert f"current.K_p_d_v_per_a {design['current.K_p_d_v_per_a']:.6g} V/A imc" in text
     assert f"current_d: phase margin {design.loops['current_d'].phase_margin_deg:.1f} deg" in text
     assert design.notes[0] in text

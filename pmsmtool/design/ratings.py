@@ -238,6 +238,7 @@ def _inverter(source: MachineFile) -> dict[str, DesignValue]:
         "inverter.V_dead_v": DesignValue(V_dead, how),
         "inverter.i_knee_apk": DesignValue(i_knee, how),
         "inverter.U_dc_nom_v": DesignValue(inverter.U_dc_v, GIVEN),
+        **{f"inverter.{name}": DesignValue(value, GIVEN) for name, value in inverter.shunt_values().items()},
     }
 
 

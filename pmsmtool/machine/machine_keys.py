@@ -69,7 +69,15 @@ INVERTER_KEYS: tuple[Key, ...] = (
     _key("inverter", "f_s_hz", "Hz", 100, 200_000, None, "sampling and PWM frequency", required=True),
     _key("inverter", "dead_time_s", "s", 0, 2e-5, 0.0, "dead time per switching edge"),
     _key("inverter", "delay_periods", "1", 0.5, 3, 1.5, "delay from sample to mean applied voltage, in periods"),
-    _key("inverter", "voltage_utilisation", "1", 0.1, 0.6366198, 1 / math.sqrt(3.0), "V_max / U_dc"),
+    _key(
+        "inverter",
+        "voltage_utilisation",
+        "1",
+        0.1,
+        0.6366198,
+        1 / math.sqrt(3.0),
+        "V_max / U_dc; above 0.5774: overmodulation, needs the last three here",
+    ),
     _key("inverter", "V_dead_v", "V", 0, 1e3, None, "plateau of the voltage error of one phase"),
     _key("inverter", "i_knee_apk", "A", 1e-4, 1e4, None, "current at which it reaches its plateau"),
     _key("inverter", "voltage_error_i_apk", "A", -1e5, 1e5, (), "increasing currents of the table", kind="floats"),
@@ -77,6 +85,18 @@ INVERTER_KEYS: tuple[Key, ...] = (
     _key("inverter", "current_lag_s", "s", 0, 1e-3, None, "time constant of the current sensors"),
     _key("inverter", "sampling_instant_s", "s", -1e-3, 1e-3, None, "sampling of the currents after the PWM centre"),
     _key("inverter", "U_dc_chopper_v", "V", 1, 2000, None, "voltage at which a brake chopper holds the link"),
+    _key("inverter", "min_off_time_s", "s", 0, 2e-5, None, "time a leg's lower switch is on in each period"),
+    _key("inverter", "sample_window_s", "s", 0, 2e-5, None, "time that reading a shunt takes"),
+    _key(
+        "inverter",
+        "shunts",
+        "1",
+        0,
+        3,
+        None,
+        "shunts: 1 in the link, 3 in the legs, 0: sensors in the phases",
+        kind="int",
+    ),
 )
 
 ENCODER_KEYS: tuple[Key, ...] = (

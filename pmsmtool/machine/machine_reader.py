@@ -24,7 +24,7 @@ from pmsmtool.machine.machine_keys import (
     estimate_keys,
     estimated_key,
 )
-from pmsmtool.machine.parameters import Estimate, MachineParameters
+from pmsmtool.machine.parameters import LINEAR_UTILISATION, Estimate, InverterParameters, MachineParameters
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
 from pmsmtool.units import UNITS
 
@@ -43,6 +43,10 @@ OTHER_TABLES = ("estimate", "conditions", "provenance", "flux_map")
 LARGEST_RATIO = 10
 """Of a standard deviation to its value, and of a value to its estimate; more is another unit or a slip of the pen."""
 ELSEWHERE = {key.name: table for table in ("limits", "encoder", "inverter", "machine") for key in TABLES[table]}
+
+
+OVERMODULATION_NEEDS = ("min_off_time_s", "sample_window_s", "shunts")
+"""Keys of ``[inverter]`` without which no voltage is beyond the linear range."""
 
 
 class MachineReader:
@@ -84,6 +88,7 @@ class MachineReader:
         parts["flux_map"] = self.flux_map(parts["machine"].get("flux_map"), folder)
         self.iron_loss_map(parts["machine"].get("iron_loss_map"), folder)
         self.consistency(parts)
+        self.overmodulation(parts["inverter"])
         return parts
 
     def names(self) -> None:
@@ -184,6 +189,31 @@ class MachineReader:
             )
         elif any(b <= a for a, b in pairwise(currents)):
             self.violations.append(f"{self.place('inverter', 'voltage_error_i_apk')} does not increase")
+
+    def overmodulation(self, values: dict[str, Any]) -> None:
+        """Voltages beyond the linear range: what they need and where they end. Below, the linear range is the limit."""
+        if any(name not in values for name in ("U_dc_v", "f_s_hz")):
+            return
+        inverter = InverterParameters(**values)
+        if inverter.linear_utilisation < LINEAR_UTILISATION / 2.0:
+            self.violations.append(f"{self.place('inverter', 'min_off_time_s')} is more than half of a period")
+        place = self.place("inverter", "voltage_utilisation")
+        missing = [name for name in OVERMODULATION_NEEDS if values.get(name) is None]
+        asked = inverter.voltage_utilisation
+        if not inverter.overmodulates:
+            values["voltage_utilisation"] = min(asked, inverter.linear_utilisation)
+        elif missing:
+            self.violations.append(
+                f"{place} = {asked:g} is overmodulation (above {LINEAR_UTILISATION:.4f}): "
+                f"state {', '.join(missing)}, too"
+            )
+        elif inverter.shunts == 2:
+            self.violations.append(f"{self.place('inverter', 'shunts')} = 2, allowed are 0, 1 and 3")
+        elif asked > inverter.largest_utilisation:
+            self.violations.append(
+                f"{place} = {asked:g} is above {inverter.largest_utilisation:.4f}, the fundamental of six steps with "
+                f"this min_off_time_s, sample_window_s and shunts"
+            )
 
     def deviation(self, key: Key, values: Mapping[str, dict[str, Any]]) -> None:
         """A deviation many times the value, or an estimate of another size than the value beside it."""

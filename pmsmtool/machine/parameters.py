@@ -113,6 +113,13 @@ class MachineParameters:
         return air_gap_torque(self.pole_pairs, psi_d, psi_q, i_d_a, i_q_a)
 
 
+LINEAR_UTILISATION = 1.0 / math.sqrt(3.0)
+ROUNDED = 1e-5
+"""Share by which a utilisation may be beyond the linear one by rounding."""
+SIX_STEPS_MIDDLE, SIX_STEPS_HALF_EDGE = 3.0 / math.pi, (math.sqrt(3.0) - 1.5) / math.pi
+"""Fundamental of six steps over the linear limit: of the middles of the hexagon's edges, and of half an edge."""
+
+
 @dataclass(frozen=True, slots=True)
 class InverterParameters:
     """Inverter and timing (``[inverter]`` of a machine file).
@@ -121,7 +128,8 @@ class InverterParameters:
     (increasing currents, odd in the current where only positive ones are given); ``V_dead_v`` and ``i_knee_apk``
     are its plateau and knee, what the drive's own compensation takes. ``current_lag_s`` is the time constant of the
     current sensors, ``sampling_instant_s`` when they are sampled after the PWM centre. ``U_dc_chopper_v``
-    is the voltage at which a brake chopper holds the link; None: there is none.
+    is the voltage at which a brake chopper holds the link; None: there is none. ``min_off_time_s``, ``sample_window_s``
+    and ``shunts`` (1 in the link, 3 in the legs, 0: sensors in the phases) say what overmodulation has to leave.
     """
 
     U_dc_v: float
@@ -136,6 +144,9 @@ class InverterParameters:
     current_lag_s: float | None = None
     sampling_instant_s: float | None = None
     U_dc_chopper_v: float | None = None
+    min_off_time_s: float | None = None
+    sample_window_s: float | None = None
+    shunts: int | None = None
 
     @property
     def T_s(self) -> float:
@@ -146,6 +157,36 @@ class InverterParameters:
     def V_max_v(self) -> float:
         """Largest phase voltage amplitude in use (V peak)."""
         return self.voltage_utilisation * self.U_dc_v
+
+    @property
+    def overmodulates(self) -> bool:
+        """Whether V_max is beyond what sinusoidal voltages reach, U_dc / sqrt(3)."""
+        return self.voltage_utilisation > (1.0 + ROUNDED) * LINEAR_UTILISATION
+
+    @property
+    def linear_utilisation(self) -> float:
+        """Voltage utilisation up to which the voltages are sinusoidal."""
+        return LINEAR_UTILISATION * (1.0 - (self.min_off_time_s or 0.0) * self.f_s_hz)
+
+    def shunt_values(self) -> dict[str, float]:
+        """Parameters ``inverter.*`` of the low-side times (ns) and the shunts; 0 where nothing is stated."""
+        return {
+            "min_off_time_ns": float(round(1e9 * (self.min_off_time_s or 0.0))),
+            "sample_window_ns": float(round(1e9 * (self.sample_window_s or 0.0))),
+            "shunts": float(self.shunts or 0),
+        }
+
+    @property
+    def largest_utilisation(self) -> float:
+        """Voltage utilisation whose fundamental six steps have, less what the shunts need (docs/control.md, 8)."""
+        used = 1.0 - (self.min_off_time_s or 0.0) * self.f_s_hz
+        window = (self.sample_window_s or 0.0) * self.f_s_hz
+        edge = 2.0  # halves of an edge of the hexagon
+        if self.shunts == 3:
+            edge -= 2.0 * max(0.0, 1.0 - (1.0 - window) / used)
+        elif self.shunts == 1:
+            edge -= 8.0 * window / used
+        return self.linear_utilisation * (SIX_STEPS_MIDDLE + SIX_STEPS_HALF_EDGE * edge)
 
 
 @dataclass(frozen=True, slots=True)

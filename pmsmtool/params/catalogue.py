@@ -123,6 +123,9 @@ CATALOGUE: tuple[Parameter, ...] = (
         ("V_dead_v", _F32, "V", 0, 0, 1e3, "compensated voltage error of one phase"),
         ("i_knee_apk", _F32, "A", 0.5, 1e-4, 1e4, "current at which the error reaches its plateau"),
         ("U_dc_nom_v", _F32, "V", 210, 1, 2000, "nominal DC-link voltage"),
+        ("min_off_time_ns", _U16, "ns", 0, 0, 20000, "time a leg's lower switch is on in each period"),
+        ("sample_window_ns", _U16, "ns", 0, 0, 20000, "time that reading a shunt takes"),
+        ("shunts", _U8, "1", 0, 0, 3, "shunts: 1 in the link, 3 in the legs, 0: sensors in the phases"),
     ),
     *_object(
         0x2012, "protection",

@@ -53,7 +53,6 @@ CASES: dict[str, tuple[dict[str, float], float, float]] = {
     "hexagon, low voltage": ({"current__options": 15}, 620.0, 180.0),
     "plain clip": ({"current__options": 3}, 620.0, 180.0),
     "no feed-forward": ({"current__options": 4}, -620.0, 210.0),
-    "over-modulation": ({"inverter__voltage_utilisation": 0.6366}, 700.0, 200.0),
     "short delay": ({"inverter__delay_periods": 0.5}, 620.0, 210.0),
 }
 
@@ -77,7 +76,7 @@ def test_current_control_equals_the_twin_bit_for_bit(case: str) -> None:
         assert bits(loop.state.integrator.d, loop.state.integrator.q) == bits(*twin.x), k
         assert live.flags == twin.flags, k
         seen |= live.flags
-    expected = {"rated": 0, "over-modulation": FLAG_DUTY, "hexagon, low voltage": FLAG_DUTY}.get(case, FLAG_VOLTAGE)
+    expected = {"rated": 0, "hexagon, low voltage": FLAG_DUTY}.get(case, FLAG_VOLTAGE)
     assert seen & expected == expected
 
 

@@ -286,7 +286,10 @@ def is_consistent(tables):
         (machine, "I_nom_apk", "I_max_apk"), (machine, "n_nom_rpm", "n_max_rpm"), (machine, "R_winding_ohm", "R_s_ohm"),
         (limits, "U_dc_min_v", "U_dc_max_v"),
     ]  # fmt: skip
-    return all(t.get(low, -math.inf) <= t.get(high, math.inf) for t, low, high in pairs)
+    inverter = tables["inverter"]
+    linear = inverter.get("voltage_utilisation", 0.5) < 0.577
+    short = inverter.get("min_off_time_s", 0.0) * inverter["f_s_hz"] < 0.49
+    return linear and short and all(t.get(low, -math.inf) <= t.get(high, math.inf) for t, low, high in pairs)
 
 
 def value_of(key):

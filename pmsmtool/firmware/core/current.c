@@ -68,14 +68,6 @@ void pmsm_current_demand(pmsm_period *period)
     period->u = demand(period, select_gains(period).K_p, period->reference);
 }
 
-uint32_t pmsm_uses_predictor(const pmsm_params *params)
-{
-    const uint32_t governed = (params->governor_mode != PMSM_GOVERNOR_OFF) ? params->governor_options : 0u;
-    const uint32_t asked =
-        (params->current_options & (uint32_t)PMSM_CURRENT_PREDICTOR) | (governed & (uint32_t)PMSM_GOVERNOR_PREDICTOR);
-    return (asked != 0u && params->inverter_delay_periods >= 1.0F) ? 1u : 0u;
-}
-
 pmsm_dq pmsm_hold_voltage(const pmsm_period *period, pmsm_dq i)
 {
     const pmsm_dq rotation = feed_forward(period, i);
@@ -163,7 +155,7 @@ void pmsm_current_integrate(pmsm_period *period)
     pmsm_dq target = {realised(period->reference.d, i.d, cut.d, gains.K_p.d),
                       realised(period->reference.q, i.q, cut.q, gains.K_p.q)};
     const pmsm_dq now = target;
-    if (pmsm_uses_predictor(period->params) != 0u) {
+    if (state->derived.predicts != 0u) {
         target = state->reference_realised; /* the sampled current answers to the reference of the last period */
     }
     state->integrator.d += T_s * gains.K_i.d * (target.d - i.d);

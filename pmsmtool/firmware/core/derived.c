@@ -45,6 +45,30 @@ static void prepare_magnetics(pmsm_derived *derived, const pmsm_params *params)
     }
 }
 
+static uint32_t uses_predictor(const pmsm_params *params)
+{
+    const uint32_t governed = (params->governor_mode != PMSM_GOVERNOR_OFF) ? params->governor_options : 0u;
+    const uint32_t asked =
+        (params->current_options & (uint32_t)PMSM_CURRENT_PREDICTOR) | (governed & (uint32_t)PMSM_GOVERNOR_PREDICTOR);
+    return (asked != 0u && params->inverter_delay_periods >= 1.0F) ? 1u : 0u;
+}
+
+static uint32_t uses_hexagon(const pmsm_params *params)
+{
+    const uint32_t governed = (params->governor_mode != PMSM_GOVERNOR_OFF) ? params->governor_options : 0u;
+    return ((params->current_options & PMSM_CURRENT_HEXAGON) != 0u || (governed & PMSM_GOVERNOR_HEXAGON) != 0u) ? 1u
+                                                                                                                : 0u;
+}
+
+/* The polar laws and the hexagon have their own ways beyond the linear range. */
+static uint32_t uses_overmodulation(const pmsm_params *params, const pmsm_derived *derived)
+{
+    const pmsm_real utilisation = (pmsm_real)params->inverter_voltage_utilisation;
+    return (derived->hexagon == 0u && params->polar_mode == PMSM_POLAR_OFF && utilisation > derived->utilisation_linear)
+               ? 1u
+               : 0u;
+}
+
 void pmsm_prepare(pmsm_state *state, const pmsm_params *params)
 {
     pmsm_derived *derived = &state->derived;
@@ -62,6 +86,10 @@ void pmsm_prepare(pmsm_state *state, const pmsm_params *params)
     const pmsm_real step = PMSM_C(2.0) * PMSM_PI * (pmsm_real)params->speed_filter_hz * derived->T_s;
     derived->speed_filter = step / (PMSM_C(1.0) + step);
     prepare_notch(derived, params);
+    pmsm_prepare_duties(derived, params);
+    derived->predicts = uses_predictor(params);
+    derived->hexagon = uses_hexagon(params);
+    derived->overmodulates = uses_overmodulation(params, derived);
     prepare_magnetics(derived, params);
     state->prepared = 1u;
 }

@@ -103,15 +103,15 @@ static uint32_t asks_first(const pmsm_params *params)
 }
 
 /* The current controllers act on the sampled current, their voltage a period later. */
-static uint32_t acts_late(const pmsm_params *params)
+static uint32_t acts_late(const pmsm_period *period)
 {
-    return (params->inverter_delay_periods >= 1.0F && pmsm_uses_predictor(params) == 0u) ? 1u : 0u;
+    return (period->params->inverter_delay_periods >= 1.0F && period->state->derived.predicts == 0u) ? 1u : 0u;
 }
 
 /* A voltage that acts late meets another current than the sampled one: the transfer starts from the predicted one. */
 static enum pmsm_transfer steer(pmsm_period *period, const pmsm_governor_rows *rows, pmsm_dq r, pmsm_dq *v)
 {
-    if (acts_late(period->params) == 0u) {
+    if (acts_late(period) == 0u) {
         return pmsm_minimum_time(period, &rows->row[0], rows->offset, r, rows->may_start, v);
     }
     const pmsm_dq sampled = period->i_model;
@@ -154,7 +154,7 @@ static pmsm_dq restrain(pmsm_period *period, pmsm_governor_rows *rows, pmsm_dq r
     period->flags |= (empty != 0u) ? (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK : 0u;
     const enum pmsm_transfer transfer = steer(period, rows, r, &v);
     if (transfer == PMSM_TRANSFER_FOUND) {
-        state->landing = (acts_late(period->params) == 0u) ? 1u : 0u; /* what is on its way would be asked for again */
+        state->landing = (acts_late(period) == 0u) ? 1u : 0u; /* what is on its way would be asked for again */
         *binding = PMSM_BINDING_MINIMUM_TIME;
         return v;
     }

@@ -141,7 +141,7 @@ void pmsm_governor_build(pmsm_period *period, pmsm_governor_rows *rows)
 {
     pmsm_row *now = &rows->row[0];
     pmsm_current_row(period, now);
-    if (period->hexagon != 0u) {
+    if (period->state->derived.hexagon != 0u) {
         now->V = pmsm_voltage_radius(period, pmsm_voltage_of(now, period->reference));
     }
     rows->may_start = 1u;

@@ -113,6 +113,18 @@ typedef struct {             /* constants of the active set, computed in the fir
     pmsm_dq nodes_per_ampere; /* 1/A, along its axes */
     pmsm_dq gain_per_L;      /* V/(A H) */
     uint32_t saturation_word; /* where its nodes begin, behind the words of the look-up */
+    uint32_t predicts;       /* 1: the controllers see the current one period ahead */
+    uint32_t hexagon;        /* 1: the demand may use the inverter's hexagon, only the legs limit it */
+    uint32_t overmodulates;  /* 1: a voltage beyond the linear range is meant as a fundamental */
+    pmsm_real duty_most;     /* of a leg: its lower switch is on for the rest of the period */
+    pmsm_real second_duty_most; /* of the second leg, so that two shunts of three can be read */
+    pmsm_real duties_apart;  /* of the second leg from both others beyond the linear range, for one shunt */
+    pmsm_real utilisation_linear; /* V_max / U_dc up to which a demand is what the legs make */
+    pmsm_real side_low;      /* half of an edge of the hexagon that the second leg may use, over the inscribed radius */
+    pmsm_real side_high;
+    pmsm_real over_most;     /* largest fundamental over that of the linear range, and how it is approached */
+    pmsm_real over_rate;
+    uint32_t shunts;         /* that these duties are for */
 } pmsm_derived;
 
 typedef struct {             /* memory of a PID controller */
@@ -180,6 +192,10 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     uint32_t prepared;       /* 0 fresh from pmsm_init(), 1 derived is valid, 2 derived is stale */
     pmsm_derived derived;
     pmsm_magnetics local;    /* at the present current, with a saturation table */
+    pmsm_dq harmonic_committed; /* V, stator frame: what overmodulation adds to voltage_committed, and before to that */
+    pmsm_dq harmonic_before;
+    pmsm_dq harmonic_flux;   /* Wb, stator frame: that it has made */
+    pmsm_dq harmonic_mean;   /* A, rotor frame: mean of its current */
 } pmsm_state;
 
 /* Clear the memory (all zero, kappa 1, binding 255); call at start-up and after another parameter set. */

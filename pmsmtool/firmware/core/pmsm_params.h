@@ -10,8 +10,8 @@ extern "C" {
 #endif
 
 #define PMSM_PARAMS_SCHEMA_VERSION 1u
-#define PMSM_PARAMS_SIGNATURE 0x49E6AE16u /* CRC-32 of name:type:dim:unit:scale in struct order */
-#define PMSM_PARAMS_WORDS 97u
+#define PMSM_PARAMS_SIGNATURE 0xAD57A489u /* CRC-32 of name:type:dim:unit:scale in struct order */
+#define PMSM_PARAMS_WORDS 100u
 #define PMSM_PARAMS_LUT_WORDS_MAX 8192u
 #define PMSM_K_MAX_NOT_DETERMINED 255u
 
@@ -42,6 +42,9 @@ typedef struct pmsm_params {
     float    inverter_V_dead_v;              /* [V] compensated voltage error of one phase */
     float    inverter_i_knee_apk;            /* [A] current at which the error reaches its plateau */
     float    inverter_U_dc_nom_v;            /* [V] nominal DC-link voltage */
+    uint32_t inverter_min_off_time_ns;       /* [ns] time a leg's lower switch is on in each period */
+    uint32_t inverter_sample_window_ns;      /* [ns] time that reading a shunt takes */
+    uint32_t inverter_shunts;                /* shunts: 1 in the link, 3 in the legs, 0: sensors in the phases */
     float    protection_i_trip_apk;          /* [A] instantaneous trip of any phase current */
     float    protection_U_dc_min_v;          /* [V] undervoltage trip */
     float    protection_U_dc_max_v;          /* [V] overvoltage trip */

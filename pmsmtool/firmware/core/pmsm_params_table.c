@@ -29,6 +29,9 @@ const pmsm_param_limit pmsm_param_limits[PMSM_PARAMS_WORDS] = {
     {0.0F, 1000.0F, 0u}, /* inverter.V_dead_v */
     {9.99999975e-05F, 10000.0F, 0u}, /* inverter.i_knee_apk */
     {1.0F, 2000.0F, 0u}, /* inverter.U_dc_nom_v */
+    {0.0F, 20000.0F, 1u}, /* inverter.min_off_time_ns */
+    {0.0F, 20000.0F, 1u}, /* inverter.sample_window_ns */
+    {0.0F, 3.0F, 1u}, /* inverter.shunts */
     {0.00100000005F, 100000.0F, 0u}, /* protection.i_trip_apk */
     {0.0F, 2000.0F, 0u}, /* protection.U_dc_min_v */
     {1.0F, 2000.0F, 0u}, /* protection.U_dc_max_v */

@@ -33,9 +33,10 @@ typedef struct {
     pmsm_dq u;                 /* V, demanded */
     pmsm_dq u_realised;        /* V, after the limits, without dead-time compensation */
     pmsm_dq u_compensation;    /* V, dead-time compensation, when it is to be recorded */
-    uint32_t hexagon;          /* 1: the demand may use the inverter's hexagon, only the legs limit it */
     uint32_t flags;
     uint32_t steps;            /* Newton steps of field weakening and governor, up to PMSM_PROJECTION_STEPS */
+    pmsm_dq i_harmonic;        /* A, of overmodulation: sampled, not in i */
+    pmsm_dq u_harmonic;        /* V, stator frame: what overmodulation adds to u_realised */
 } pmsm_period;
 
 /* derived.c */
@@ -70,7 +71,6 @@ pmsm_lookup_row pmsm_lookup_at_speed(pmsm_period *period);
 pmsm_dq pmsm_lookup(pmsm_period *period, const pmsm_lookup_row *row, pmsm_real tau);
 
 /* current.c */
-uint32_t pmsm_uses_predictor(const pmsm_params *params);
 void pmsm_current_demand(pmsm_period *period);
 void pmsm_current_integrate(pmsm_period *period);
 void pmsm_current_row(const pmsm_period *period, pmsm_row *row); /* demand as a function of the reference */
@@ -101,6 +101,13 @@ enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, p
 /* polar.c: the laws of polar.mode in place of the current controller */
 void pmsm_polar_demand(pmsm_period *period);
 void pmsm_polar_settle(pmsm_period *period);
+
+/* overmodulation.c; *beyond becomes 1 where u is outside the linear range */
+void pmsm_prepare_duties(pmsm_derived *derived, const pmsm_params *params);
+pmsm_dq pmsm_lengthen(const pmsm_period *period, pmsm_dq u, uint32_t *beyond);
+uint32_t pmsm_make_readable(const pmsm_derived *derived, uint32_t beyond, pmsm_abc wanted, pmsm_output *output);
+pmsm_ab pmsm_part_harmonics(pmsm_period *period, pmsm_dq asked, pmsm_ab applied); /* returns the fundamental */
+void pmsm_remove_harmonics(pmsm_period *period);
 
 /* modulation.c */
 pmsm_real pmsm_voltage_radius(const pmsm_period *period, pmsm_dq u); /* what the inverter gives in direction u */

@@ -31,6 +31,10 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->integrator = zero;
     state->voltage_committed = zero;
     state->voltage_before = zero;
+    state->harmonic_committed = zero;
+    state->harmonic_before = zero;
+    state->harmonic_flux = zero;
+    state->harmonic_mean = zero;
     state->reference_held = zero;
     state->reference_realised = zero;
     state->disturbance = zero;
@@ -86,13 +90,6 @@ static pmsm_real winding_resistance(const pmsm_params *params, pmsm_real T_windi
     return (rise == rise) ? R_s * (PMSM_C(1.0) + (pmsm_real)params->motor_alpha_R_per_k * rise) : R_s;
 }
 
-static uint32_t uses_hexagon(const pmsm_params *params)
-{
-    const uint32_t governed = (params->governor_mode != PMSM_GOVERNOR_OFF) ? params->governor_options : 0u;
-    return ((params->current_options & PMSM_CURRENT_HEXAGON) != 0u || (governed & PMSM_GOVERNOR_HEXAGON) != 0u) ? 1u
-                                                                                                                : 0u;
-}
-
 static void transform(pmsm_period *period, const pmsm_measurement *m, pmsm_real advance)
 {
     const pmsm_abc phases = {m->i_a, m->i_b, m->i_c};
@@ -105,7 +102,6 @@ static void transform(pmsm_period *period, const pmsm_measurement *m, pmsm_real 
     period->U_dc = (m->U_dc > LINK_LEAST) ? m->U_dc : PMSM_C(0.0);
     period->V_max = (pmsm_real)period->params->inverter_voltage_utilisation * period->U_dc;
     period->R_s = winding_resistance(period->params, m->T_winding);
-    period->hexagon = uses_hexagon(period->params);
 }
 
 /* The current the mode asks for. */
@@ -131,7 +127,7 @@ static void follow_saturation(pmsm_period *period, pmsm_dq i)
 
 static void field_oriented(pmsm_period *period, pmsm_output *output)
 {
-    if (pmsm_uses_predictor(period->params) != 0u) {
+    if (period->state->derived.predicts != 0u) {
         period->i_model = pmsm_predict_current(period);
         follow_saturation(period, period->i_model);
     }
@@ -252,6 +248,10 @@ static void publish(pmsm_period *period, const pmsm_measurement *m)
     pmsm_live *live = &period->state->live;
     live->i_d = period->i.d;
     live->i_q = period->i.q;
+    if (period->state->derived.overmodulates != 0u) {
+        live->i_d += period->i_harmonic.d;
+        live->i_q += period->i_harmonic.q;
+    }
     live->i_d_ref = period->reference.d;
     live->i_q_ref = period->reference.q;
     live->u_d = period->u.d;
@@ -302,6 +302,9 @@ void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut
     state->live.iterations = 0u;
     transform(&period, measurement, advance);
     pmsm_update_i2t(&period);
+    if (state->derived.overmodulates != 0u) {
+        pmsm_remove_harmonics(&period);
+    }
     state->omega_filtered += state->derived.speed_filter * (period.omega_M - state->omega_filtered);
     if (state->fault != (uint32_t)PMSM_FAULT_NONE || reference->mode == PMSM_MODE_FAULT) {
         react(state, params, measurement->omega_e, output);
@@ -327,6 +330,10 @@ void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut
         state->voltage_before = state->voltage_committed;
         state->voltage_committed.d = output->u_alpha;
         state->voltage_committed.q = output->u_beta;
+        if (state->derived.overmodulates != 0u) {
+            state->harmonic_before = state->harmonic_committed;
+            state->harmonic_committed = period.u_harmonic;
+        }
     }
     state->bad_periods = 0u;
     state->gates_before = output->gates;

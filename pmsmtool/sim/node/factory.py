@@ -47,6 +47,7 @@ def factory_values(machine_file: MachineFile) -> dict[str, float]:
         "inverter.dead_time_ns": round(inverter.dead_time_s * 1e9),
         "inverter.delay_periods": inverter.delay_periods,
         "inverter.U_dc_nom_v": inverter.U_dc_v,
+        **{f"inverter.{name}": value for name, value in inverter.shunt_values().items()},
         "protection.i_trip_apk": limits.i_trip_apk or TRIP_SHARE * i_max,
         "protection.I_cont_apk": limits.I_cont_apk or i_nom,
         "protection.U_dc_min_v": limits.U_dc_min_v or DC_LOW_SHARE * inverter.U_dc_v,

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: MIT
+"""Voltages beyond the linear range, against a projection on the hexagon that is written out here."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.firmware.core_binding import core
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file, parse_machine
+from pmsmtool.machine.profile import machine_path
+from tests.firmware.closed_loop import FLAG_DUTY, MODE_CURRENT, Loop, tuned
+
+T_S_NS = 100_000
+U_DC = 300.0
+FUNDAMENTAL = 5e-4
+"""Of the linear limit, sensors in the phases; measured 3e-4."""
+FUNDAMENTAL_SHUNTS = 5e-3
+"""With windows of up to 4 % of the period; measured 3.3e-3 where one shunt leaves 1.0 of the linear limit no length."""
+TIMES = 1e-3
+"""ns, rounding of a duty ratio."""
+
+
+def ask(fundamental: float, angles: np.ndarray, *, off: int = 0, window: int = 0, shunts: int = 0) -> np.ndarray:
+    """Duty ratios (n, 3) of a demanded voltage over the linear limit at angles of the frame, from a core at rest."""
+    values = tuned(
+        inverter__T_s_ns=T_S_NS, inverter__voltage_utilisation=0.6366, inverter__min_off_time_ns=off,
+        inverter__sample_window_ns=window, inverter__shunts=shunts, current__options=0, motor__I_max_apk=1e5,
+        protection__I_cont_apk=1e5,
+    )  # fmt: skip
+    values |= {f"current.{gain}": 0.0 for gain in ("K_i_d_v_per_as", "K_i_q_v_per_as")}
+    values |= {f"current.K_p_{axis}_v_per_a": 1.0 for axis in "dq"}
+    loop = Loop(core(double=True), values, omega=0.0, U_dc=U_DC)
+    linear = (1.0 - off / T_S_NS) * U_DC / math.sqrt(3.0)
+    duties = []
+    for angle in angles:
+        loop.binding.library.pmsm_init(ctypes.byref(loop.state))
+        loop.measurement.theta_e = float(angle)
+        loop.reference.mode, loop.reference.i_d_ref = MODE_CURRENT, fundamental * linear
+        out = loop.output
+        loop.binding.library.pmsm_step(loop.state, loop.params, None, loop.measurement, loop.reference, out)
+        duties.append((out.duty_a, out.duty_b, out.duty_c))
+    return np.array(duties)
+
+
+def voltage(duties: np.ndarray) -> np.ndarray:
+    """Stator voltage (V, complex) of duty ratios."""
+    third = complex(-0.5, math.sqrt(0.75))
+    return 2.0 / 3.0 * U_DC * (duties @ np.array([1.0, third, third.conjugate()]))
+
+
+@pytest.mark.parametrize("shunts", [0, 1, 3])
+@given(asked=st.floats(1.002, 1.09), off=st.integers(0, 3000), window=st.integers(500, 4000), start=st.floats(0.0, 0.1))
+@settings(max_examples=12, deadline=None)
+def test_the_fundamental_is_the_one_that_was_asked_for(
+    shunts: int, asked: float, off: int, window: int, start: float
+) -> None:
+    angles = start + np.arange(180) * 2.0 * math.pi / 180
+    linear = (1.0 - off / T_S_NS) * U_DC / math.sqrt(3.0)
+    made = voltage(ask(asked, angles, off=off, window=window, shunts=shunts))
+    inverter = replace(
+        load_machine_file(machine_path("interior-2k2")).inverter,
+        f_s_hz=1e9 / T_S_NS, min_off_time_s=1e-9 * off, sample_window_s=1e-9 * window, shunts=shunts,
+    )  # fmt: skip
+    most = inverter.largest_utilisation / inverter.linear_utilisation
+    found = np.mean(made * np.exp(-1j * angles))
+    limit = FUNDAMENTAL_SHUNTS if shunts else FUNDAMENTAL
+    assert abs(found.real / linear - min(asked, most)) < limit
+    assert abs(found.imag / linear) < limit
+
+
+def test_a_leg_leaves_the_lower_switch_its_time_and_shunts_their_window() -> None:
+    angles = np.linspace(0.0, 2.0 * math.pi, 721)
+    low, off, window = 0.0, 1500, 4000
+    for asked in (0.9, 1.0, 1.04, 1.09):
+        for shunts in (0, 1, 3):
+            duties = np.sort(ask(asked, angles, off=off, window=window, shunts=shunts), axis=1)
+            assert duties[:, 0].min() >= low
+            assert (1.0 - duties[:, 2].max()) * T_S_NS >= off - TIMES
+            if shunts == 3:
+                assert (1.0 - duties[:, 1].max()) * T_S_NS >= window - TIMES
+            elif shunts == 1 and asked > 1.0:
+                assert np.diff(duties, axis=1).min() / 2.0 * T_S_NS >= window - TIMES
+    plain = np.sort(ask(1.09, angles, off=off), axis=1)
+    assert (1.0 - plain[:, 1].max()) * T_S_NS < off + TIMES, "without shunts the second leg goes as far as the first"
+
+
+def test_the_legs_make_the_nearest_point_of_the_hexagon() -> None:
+    """Of a longer demand in the same direction: tried against a fine search along the hexagon's outline."""
+    corners = 2.0 / 3.0 * U_DC * np.exp(1j * math.pi / 3.0 * np.arange(7))
+    outline = np.concatenate([a + (b - a) * np.linspace(0, 1, 4000) for a, b in pairwise(corners)])
+    angles = np.linspace(0.05, 1.0, 12)
+    for angle, made in zip(angles, voltage(ask(1.06, angles)), strict=True):
+        assert np.abs(outline - made).min() < 0.1, "on the outline"
+        lengths = np.linspace(170.0, 230.0, 400)
+        nearest = outline[np.abs(outline[:, None] - lengths * np.exp(1j * angle)).argmin(axis=0)]
+        assert np.abs(nearest - made).min() < 0.3, "(V) grid of lengths and outline"
+
+
+def held(fundamental: float, rpm: float) -> np.ndarray:
+    """Currents (A, n x 2) of the Table 1 machine held at a voltage over the linear limit."""
+    i, omega = (-20.0, 20.0), rpm * 4.0 * math.pi / 30.0
+    values = tuned(2000.0, inverter__voltage_utilisation=0.635, inverter__delay_periods=1.5)
+    values |= {f"current.K_i_{axis}_v_per_as": 2000.0 * values["motor.R_s_ohm"] for axis in "dq"}
+    R, L_d, L_q = (values[f"motor.{name}"] for name in ("R_s_ohm", "L_d_h", "L_q_h"))
+    u = R * i[0] - omega * L_q * i[1], R * i[1] + omega * (L_d * i[0] + values["motor.psi_f_wb"])
+    loop = Loop(core(), values, omega=omega, U_dc=math.hypot(*u) * math.sqrt(3.0) / fundamental)
+    loop.settle_at(*i)
+    seen = []
+    for _ in range(3000):
+        live = loop.step(mode=MODE_CURRENT, i_d_ref=i[0], i_q_ref=i[1])
+        seen.append((live.i_d - i[0], live.i_q - i[1]))
+    assert live.flags & FLAG_DUTY or fundamental <= 1.0
+    return np.array(seen[1500:])
+
+
+MEAN_OFF_A = 0.05
+"""Of 28 A; measured 0.013. With the harmonics left in the sampled current 1.2 to 2.6."""
+
+
+@pytest.mark.parametrize("fundamental", [1.0, 1.02, 1.05, 1.07, 1.09])
+def test_the_controller_does_not_answer_to_the_harmonics(fundamental: float) -> None:
+    off = held(fundamental, 2000.0)
+    assert np.abs(off.mean(axis=0)).max() < MEAN_OFF_A
+    assert (np.abs(off).max() > 0.5) == (fundamental > 1.01), "they are in what is recorded"
+
+
+TEXT = dump_machine_file(load_machine_file(machine_path("interior-2k2")))
+
+
+def machine(**inverter: float) -> MachineFile:
+    lines = "".join(f"{name} = {value}\n" for name, value in inverter.items())
+    plain = "\n".join(line for line in TEXT.splitlines() if not line.startswith("voltage_utilisation"))
+    return parse_machine(plain.replace("[inverter]\n", f"[inverter]\n{lines}"))
+
+
+def test_a_file_must_state_what_overmodulation_has_to_leave() -> None:
+    with pytest.raises(ConfigError, match="machine") as missing:
+        machine(voltage_utilisation=0.61, shunts=3)
+    assert "overmodulation" in missing.value.violations[0]
+    assert "min_off_time_s, sample_window_s" in missing.value.violations[0]
+    stated = {"min_off_time_s": 1e-6, "sample_window_s": 2e-6}
+    assert machine(voltage_utilisation=0.61, shunts=3, **stated).inverter.overmodulates
+    with pytest.raises(ConfigError, match="machine") as beyond:
+        machine(voltage_utilisation=0.63, shunts=1, min_off_time_s=1e-6, sample_window_s=4e-6)
+    assert "six steps" in beyond.value.violations[0]
+    with pytest.raises(ConfigError, match="machine") as two:
+        machine(voltage_utilisation=0.61, shunts=2, **stated)
+    assert "0, 1 and 3" in two.value.violations[0]
+
+
+def test_without_it_a_minimum_time_lowers_the_linear_limit() -> None:
+    inverter = machine(min_off_time_s=2e-6).inverter
+    assert inverter.voltage_utilisation == pytest.approx((1.0 - 2e-6 * inverter.f_s_hz) / math.sqrt(3.0))
+    assert not inverter.overmodulates
+    fast = TEXT.replace("f_s_hz = 12000.0", "f_s_hz = 30000.0")
+    with pytest.raises(ConfigError, match="machine") as long:
+        parse_machine(fast.replace("[inverter]\n", "[inverter]\nmin_off_time_s = 2e-5\n"))
+    assert "more than half of a period" in long.value.violations[0]
+    assert not machine().inverter.overmodulates
