@@ -29,6 +29,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import IntEnum
+from typing import TypedDict, Unpack
 
 
 class ExitCode(IntEnum):
@@ -48,6 +49,14 @@ class ExitCode(IntEnum):
     INTERNAL = 70
     INTERRUPTED = 130
     READER_GONE = 141
+
+
+class Said(TypedDict, total=False):
+    """What every error may say besides what happened; see :class:`PmsmtoolError`."""
+
+    where: str
+    likely: str
+    hint: str
 
 
 class PmsmtoolError(Exception):
@@ -88,16 +97,8 @@ class ConfigError(PmsmtoolError, ValueError):
 
     exit_code = ExitCode.USAGE
 
-    def __init__(
-        self,
-        what: str,
-        *,
-        where: str = "",
-        likely: str = "",
-        hint: str = "",
-        violations: Sequence[str] = (),
-    ) -> None:
-        super().__init__(what, where=where, likely=likely, hint=hint)
+    def __init__(self, what: str, *, violations: Sequence[str] = (), **said: Unpack[Said]) -> None:
+        super().__init__(what, **said)
         self.violations = tuple(violations)
 
     def __str__(self) -> str:
@@ -149,18 +150,8 @@ class SdoAbort(DriveFault):
         The object of the transfer.
     """
 
-    def __init__(
-        self,
-        code: int,
-        index: int,
-        sub: int,
-        what: str,
-        *,
-        where: str = "",
-        likely: str = "",
-        hint: str = "",
-    ) -> None:
-        super().__init__(what, where=where, likely=likely, hint=hint)
+    def __init__(self, code: int, index: int, sub: int, what: str, **said: Unpack[Said]) -> None:
+        super().__init__(what, **said)
         self.code = code
         self.index = index
         self.sub = sub
@@ -175,23 +166,8 @@ class SafetyRefusal(PmsmtoolError):
 class LimitExceeded(SafetyRefusal):
     """A quantity is outside its safety limit."""
 
-    def __init__(
-        self,
-        quantity: str,
-        value: float,
-        limit: float,
-        unit: str,
-        *,
-        where: str = "",
-        likely: str = "",
-        hint: str = "",
-    ) -> None:
-        super().__init__(
-            f"{quantity} {value:.6g} {unit} is outside the limit {limit:.6g} {unit}",
-            where=where,
-            likely=likely,
-            hint=hint,
-        )
+    def __init__(self, quantity: str, value: float, limit: float, unit: str, **said: Unpack[Said]) -> None:
+        super().__init__(f"{quantity} {value:.6g} {unit} is outside the limit {limit:.6g} {unit}", **said)
         self.quantity = quantity
         self.value = value
         self.limit = limit
@@ -209,8 +185,8 @@ class IdentificationError(PmsmtoolError):
 
     exit_code = ExitCode.NOT_TRUSTWORTHY
 
-    def __init__(self, reason: str, what: str, *, where: str = "", likely: str = "", hint: str = "") -> None:
-        super().__init__(f"{reason}: {what}", where=where, likely=likely, hint=hint)
+    def __init__(self, reason: str, what: str, **said: Unpack[Said]) -> None:
+        super().__init__(f"{reason}: {what}", **said)
         self.reason = reason
 
 
@@ -237,16 +213,8 @@ class Partial(PmsmtoolError):
 
     exit_code = ExitCode.PARTIAL
 
-    def __init__(
-        self,
-        what: str,
-        *,
-        where: str = "",
-        likely: str = "",
-        hint: str = "",
-        missing: Sequence[str] = (),
-    ) -> None:
-        super().__init__(what, where=where, likely=likely, hint=hint)
+    def __init__(self, what: str, *, missing: Sequence[str] = (), **said: Unpack[Said]) -> None:
+        super().__init__(what, **said)
         self.missing = tuple(missing)
 
     def __str__(self) -> str:
@@ -266,16 +234,8 @@ class Contradiction(CheckFailed):
 class VerifyMismatch(CheckFailed):
     """What the drive holds differs from what it should hold; ``differences`` has one line each."""
 
-    def __init__(
-        self,
-        what: str,
-        *,
-        where: str = "",
-        likely: str = "",
-        hint: str = "",
-        differences: Sequence[str] = (),
-    ) -> None:
-        super().__init__(what, where=where, likely=likely, hint=hint)
+    def __init__(self, what: str, *, differences: Sequence[str] = (), **said: Unpack[Said]) -> None:
+        super().__init__(what, **said)
         self.differences = tuple(differences)
 
     def __str__(self) -> str:

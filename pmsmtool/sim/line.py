@@ -109,10 +109,11 @@ class Line:
 
     def queue(self, sender: Node | Endpoint, frame: Frame) -> None:
         """Queue a frame for the wire."""
+        if self._on_wire is None:  # nothing to arbitrate with
+            self._put_on_wire(sender, frame)
+            return
         self._count += 1
         heapq.heappush(self._pending, (_priority(frame), self._count, sender, frame))
-        if self._on_wire is None:
-            self._start()
 
     def withdraw(self, sender: Node, can_id: int | None) -> None:
         """Take back queued frames of a node, of one identifier or all."""
@@ -137,8 +138,7 @@ class Line:
         )
         return bits * NS // (self.bitrate or NOMINAL_BITRATE)
 
-    def _start(self) -> None:
-        _, _, sender, frame = heapq.heappop(self._pending)
+    def _put_on_wire(self, sender: Node | Endpoint, frame: Frame) -> None:
         self._on_wire = sender, frame
         duration_ns = self._duration_ns(frame)
         self.wire_ns += duration_ns
@@ -150,22 +150,18 @@ class Line:
             raise RuntimeError("nothing is on the wire")
         sender, frame = self._on_wire
         self.frames += 1
-        if isinstance(sender, Node):
-            self._carry(sender, frame, from_drive=True)
-        else:
-            acknowledged = self.is_acknowledged(sender)
-            if acknowledged:
-                self._carry(sender, frame, from_drive=False)
-            sender.transmitted(acknowledged)
+        program = None if isinstance(sender, Node) else sender
+        acknowledged = program is None or self.is_acknowledged(program)
+        if acknowledged:
+            if self._injector is None:
+                self.deliver(sender, frame)
+            else:
+                self._injector.carry(sender, frame, program is None)
+        if program is not None:
+            program.transmitted(acknowledged)
         self._on_wire = None
         if self._pending:
-            self._start()
-
-    def _carry(self, sender: Node | Endpoint, frame: Frame, *, from_drive: bool) -> None:
-        if self._injector is None:
-            self.deliver(sender, frame)
-        else:
-            self._injector.carry(sender, frame, from_drive)
+            self._put_on_wire(*heapq.heappop(self._pending)[2:])
 
     @property
     def busy(self) -> bool:
