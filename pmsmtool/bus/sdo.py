@@ -334,22 +334,21 @@ class SdoChannel:
             try:
                 self._settle(attempt)
                 return once(), count
-            except TransferLost as lost:
-                self._unsettled = True
-                self._answers.forget(self.connection.clock.now())
-                attempt.notes.append(f"try {count}: {lost.what}")
-                self._leave(attempt, lost)
-                if recover is not None and attempt.mode is Mode.EXPEDITED and recover():
-                    return b"", count
-                over = self.connection.clock.now() > attempt.until_s
-                if count < tries and not over:
-                    continue
-                if over:
-                    raise self._failure(attempt, lost, count) from None
-                if attempt.mode is not Mode.BLOCK or (self.block_supported and lost.code == AbortCode.TIMED_OUT):
-                    raise self._failure(attempt, lost, count) from None
-                attempt.mode = Mode.SEGMENTED
-                attempt.notes.append("by segments now")
+            except TransferLost as error:
+                lost = error  # outside: what comes now is told by itself, not as an error during an error
+            self._unsettled = True
+            self._answers.forget(self.connection.clock.now())
+            attempt.notes.append(f"try {count}: {lost.what}")
+            self._leave(attempt, lost)
+            if recover is not None and attempt.mode is Mode.EXPEDITED and recover():
+                return b"", count
+            over = self.connection.clock.now() > attempt.until_s
+            if count < tries and not over:
+                continue
+            if over or attempt.mode is not Mode.BLOCK or (self.block_supported and lost.code == AbortCode.TIMED_OUT):
+                raise self._failure(attempt, lost, count)
+            attempt.mode = Mode.SEGMENTED
+            attempt.notes.append("by segments now")
 
     def _upload_once(self, attempt: Attempt) -> bytes:
         if attempt.mode is Mode.BLOCK and self.block_supported is not False:

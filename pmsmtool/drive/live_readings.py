@@ -46,9 +46,15 @@ class Column:
 def available(node: DriveNode, wanted: Callable[[str], object]) -> list[str]:
     """Return the names of the live quantities that are wanted and that the drive has; raises ``NotAvailable``."""
     names = [name for name, item in LIVE.items() if wanted(name) and node.has(item.index, item.sub)]
-    if not names:
-        raise NotAvailable("the drive has no live quantity of that name", hint=f"there are {', '.join(LIVE)}")
-    return names
+    if names:
+        return names
+    if any(map(wanted, LIVE)):
+        raise NotAvailable(
+            "the drive has none of these live quantities", where=f"node {node.node}, 0x2070",
+            likely="a drive without the pmsmtool reference objects",
+            hint="`pmsmtool param get 0x6064 0x6077 0x6078` reads what CiA 402 knows, `monitor --log` what it sends",
+        )  # fmt: skip
+    raise NotAvailable("there is no live quantity of that name", hint=f"there are {', '.join(LIVE)}")
 
 
 def readings(node: DriveNode, names: list[str], period_s: float, seconds: float | None) -> Readings:

@@ -213,8 +213,13 @@ def test_a_stop_without_a_valid_answer_ends_within_two_seconds(flood: bool) -> N
 def test_a_stop_whose_answers_begin_and_never_end_does_not_wait_for_them() -> None:
     """Each segmented upload stalls after its first frame: 9.6 s passed before."""
     bus, _ = opened(lambda request: [b"\x41" + request[1:4] + b"\x02\0\0\0"] if request[0] == 0x40 else [])
-    with pytest.raises(StopNotConfirmed):
+    with pytest.raises(StopNotConfirmed) as caught:
         quick_stop(DriveNode(Connection(bus), NODE))
+    told, error = set(), caught.value.__cause__
+    while error is not None:  # what the command line lists behind `also:`
+        told.add(type(error).__name__)
+        error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
+    assert "OutOfTime" in told and "TransferLost" not in told
     assert 1.4 < bus.clock.now() < 2.2
     words = [data[4] for cob, data in bus.sent if data[1:4] == b"\x40\x60\x00" and data[0] & 0xE0 == 0x20]
     assert words[-1] == 0, "the voltage is taken away unheard"
