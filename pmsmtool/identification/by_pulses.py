@@ -20,7 +20,7 @@ from pmsmtool.estimators.flux.voltage_flux import flux_by_undriven_voltage, flux
 from pmsmtool.estimators.recorded_push import PushResult, estimate_pushes
 from pmsmtool.estimators.resistance import R_MEASURED, Copper, copper_of
 from pmsmtool.estimators.resistance import normalised as resistance_at_reference
-from pmsmtool.estimators.shaft.inertia_ratio import estimate_ratios
+from pmsmtool.estimators.shaft.inertia_ratio import BLOCKS, LEAST_PUSHES, SKIP_SHARE, estimate_ratios
 from pmsmtool.estimators.shaft.position import offset_by_turns
 from pmsmtool.files import read_text
 from pmsmtool.identification.calibration import calibrated_traces
@@ -56,6 +56,8 @@ BY_ANGLE = ("poles", "encoder")
 NO_LINK = "needs the DC link (0x6079) or the machine's voltage"
 TOO_WIDE = "E_NOT_IDENTIFIABLE"
 """Refusal of ratios whose interval is too wide: the flux linkage beside them stands, and the chain goes on."""
+LEAST_ROWS = math.ceil(BLOCKS / (1.0 - SKIP_SHARE))
+"""Readings without which a torque pulse has no block for each speed."""
 LIGHT_SHAFT = "a bare shaft with little inertia: the torque that is safe if the tool fails hardly exceeds friction"
 ADD_INERTIA = "couple an inertia to the shaft and say --shaft coupled, or allow more current (--i-max)"
 CHECK_WIRING = "switch off and measure the three line-line resistances; `pmsmtool check` looks at the wiring"
@@ -225,6 +227,16 @@ def _by_torque(
     try:
         estimates = estimate_ratios(pushes, pole_pairs=pole_pairs or 1, tolerance=tolerance)
     except IdentificationError as error:
+        enough = sum(len(push) >= LEAST_ROWS for push in pushes)
+        if error.reason == "E_EXCITATION" and enough < LEAST_PUSHES <= len(pushes):
+            raise IdentificationError(
+                error.reason,
+                f"{LEAST_ROWS} readings are needed in each of {LEAST_PUSHES} torque pulses, {enough} of {len(pushes)} "
+                "pulses have them",
+                where=error.where,
+                likely="an adapter, a bus or a drive that answers slowly",
+                hint="use another adapter or a faster bit rate, end other traffic; or couple an inertia to the shaft",
+            ) from None
         if error.reason != TOO_WIDE:
             raise
         what = error.what.removeprefix(f"{TOO_WIDE}: ")

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
 import numpy as np
 import pytest
 
+from benchmarks.random_drives import draw_drive
 from pmsmtool.commissioning.first_check_levels import beyond, judge_kept
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import LimitExceeded
@@ -18,9 +20,11 @@ from pmsmtool.experiments.first_push import WAY_RAD, push_forth_and_back
 from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG, judge_current, judge_pulses, judge_push
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.sim.line import Frame
 from pmsmtool.trace import Trace
 from tests.cli.conftest import Tool
-from tests.foreign.data_sheets import epos4, write_eds
+from tests.foreign.data_sheets import epos4, unknown, write_eds
 
 
 def checked(tool: Tool, level: str, extra: str = "encoder_bits = 17") -> tuple[int, dict[str, str]]:
@@ -142,6 +146,32 @@ def test_a_slow_current_loop_does_not_push_the_shaft_further() -> None:
 def test_a_limit_is_about_what_it_shows(quantity: str, turns: bool, about: str, verdict: str) -> None:
     row = beyond(LimitExceeded(quantity, 2.0, 1.0, "A"), turns)
     assert (row.looked_at, row.verdict) == (about, verdict)
+
+
+@pytest.mark.chain
+def test_answers_that_come_late_are_no_open_phase(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """20 ms an answer: a healthy light shaft ran beyond half a turn, and `phases` was WRONG."""
+    drive = draw_drive(705)
+    simulated = {**drive.simulation, "leads_swapped": False, "encoder_reversed": False}
+    Path("m.toml").write_text(dump_machine_file(replace(drive, simulation=simulated)), encoding="utf-8")
+    write_eds(Path("x.eds"), unknown("0x2D", (0x6079, 0, "U32", "ro", "")))
+    hear = PmsmSimBus.hear
+
+    def late(bus: PmsmSimBus, frame: Frame, own: bool) -> None:
+        if own or not 0x580 < frame.can_id < 0x600:
+            hear(bus, frame, own)
+        else:
+            bus.clock.after(0.02, lambda: hear(bus, frame, own))
+
+    monkeypatch.setattr(PmsmSimBus, "hear", late)
+    channel = "m.toml?nv=:memory:&eds=x.eds"
+    code, out, _ = tool("--sim", channel, "--yes", "check", "m.toml", "--json")
+    rows = {row["looked_at"]: (row["verdict"], row["shown"]) for row in json.loads(out)["findings"]}
+    assert code == 10 and rows["phases"][0] == NOT_CHECKED and rows["shaft"][0] == NOT_SEEN
+    assert "an answer takes 20 ms" in rows["shaft"][1]
+    code, _, said = tool("--sim", channel, "--yes", "identify", "mechanics")
+    assert code == 6 and "28 readings are needed in each of 4 torque pulses, 0 of 12 pulses have them" in said
+    assert "answers slowly" in said
 
 
 def pulsed(shown: float, sense: float, noise_rad: float = 0.0, seed: int = 1) -> list[tuple[str, str]]:
