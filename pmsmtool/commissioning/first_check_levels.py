@@ -171,7 +171,7 @@ def beyond(error: LimitExceeded, turns: bool, answer_s: float = 0.0) -> Finding:
     A push is ended by its way: what runs off then has more current than was asked for, or its way is seen too late.
     """
     if not turns and answer_s > LATE_S and not error.quantity.startswith("current"):
-        seen = f"{error.what}, and an answer takes {1e3 * answer_s:.0f} ms: the end of a push is seen too late"
+        seen = f"{error.what}, and an answer takes {1e3 * answer_s:.0f} ms: the end of a torque pulse shows too late"
         return Finding("shaft", NOT_SEEN, seen, "a slow adapter, bus or drive; or an open phase, if it is none of them")
     if error.quantity.startswith("time"):
         seen = f"the rotor had not come to rest on the vector when {error.limit:g} s were over"
