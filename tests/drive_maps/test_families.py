@@ -38,7 +38,7 @@ WITH_OWN_OBJECTS = [
     name for name in HOLDING if any(cell.index not in STANDARD for cell in load_family(name).cells.values())
 ]
 """Families that hold more than the limits of CiA 402."""
-DESIGNS = 1000
+DESIGNS, WRITTEN_OF = 1000, 5
 
 
 @contextmanager
@@ -109,19 +109,19 @@ def torque_of(design: dict[str, float], drive_map: DriveMap) -> dict[str, float]
 @pytest.mark.chain
 @pytest.mark.parametrize("family", HOLDING)
 def test_what_is_shown_before_is_what_the_drive_holds(family: str) -> None:
-    """1000 random designs: bytes, and the SI values they mean, before writing and read back."""
+    """1000 random designs: bytes and the SI values they mean; of every fifth also what the drive reads back."""
     rng = np.random.default_rng([7, len(family), ord(family[0])])
     with opened(family) as node:
         drive_map, parameters = node.map, DriveParameters(node)
         rounded = 0
-        for _ in range(DESIGNS):
+        for k in range(DESIGNS):
             design = random_design(rng) | in_amperes(drive_map, rng)
             wanted = ParameterSet({name: design[name] for name in drive_map.cells} | torque_of(design, drive_map))
             encoded, shown = drive_map.encode(wanted), drive_map.quantised(wanted)
-            parameters.replace(encoded)
-            found = parameters.read(encoded)
-            assert found == encoded
-            assert drive_map.decode(found, torque_of(design, drive_map)).values == shown.values
+            if k % WRITTEN_OF == 0:
+                parameters.replace(encoded)
+                assert parameters.read(encoded) == encoded
+            assert drive_map.decode(encoded, torque_of(design, drive_map)).values == shown.values
             rounded += shown.values != wanted.values
         whole = set(drive_map.cells) == {"motor.pole_pairs"}
         assert rounded == (0 if whole else DESIGNS)  # every design is rounded by what the family can hold
