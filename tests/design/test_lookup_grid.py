@@ -114,7 +114,7 @@ def test_the_reported_bound_is_true_on_a_ten_times_finer_grid(profile: str, stor
 @pytest.mark.chain
 def test_bounds_that_do_not_fit_the_drive_are_refused_with_what_was_reached() -> None:
     with pytest.raises(DesignInfeasible, match="nodes keep the torque within"):
-        made("mtpv-test", stored="float32", torque_bound=1e-3)
+        made("interior-2k2", stored="float32", torque_bound=1e-3)
 
 
 @pytest.mark.chain
