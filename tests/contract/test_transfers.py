@@ -22,11 +22,11 @@ def test_special_sizes_arrive_both_ways_at_the_first_try(mode: Mode, largest: in
 @pytest.mark.parametrize("rate", RATES)
 @pytest.mark.parametrize("direction", ["to drive", "from drive"])
 def test_the_tool_gets_through_a_lossy_channel(rate: float, direction: str) -> None:
-    """40 transfers here, 300 in the benchmark: there all at 0.1 %, and 98 % at 1 %."""
-    outcome = loss_row(rate, Mode.AUTO, direction, 40)
+    """20 transfers here, 300 in the benchmark: there all at 0.1 %, and 98 % at 1 %."""
+    outcome = loss_row(rate, Mode.AUTO, direction, 20)
     assert outcome.wrong == 0
     assert outcome.repeated > 0, "something was lost"
-    assert outcome.right >= (40 if rate == RATES[0] else 37)
+    assert outcome.right >= (20 if rate == RATES[0] else 18)
 
 
 def test_by_segments_a_lost_frame_costs_the_transfer_but_is_reported() -> None:
