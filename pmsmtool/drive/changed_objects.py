@@ -31,6 +31,13 @@ class ChangedObjects:
         self._drive = drive
         self._node = drive.node
         self._before: dict[_Object, bytes] = {}
+        self._sure: set[_Object] = set()
+
+    @property
+    def left(self) -> list[str]:
+        """Addresses of what was changed and is not known to hold its old content again; the marks are none of them."""
+        due = self._before.keys() - self._sure - set(_MARKS)
+        return [f"0x{index:04X}:{sub:02X}" for index, sub in sorted(due)]
 
     def begin(self) -> None:
         """Note the marks now, and from now on every object before it is written."""
@@ -65,11 +72,13 @@ class ChangedObjects:
         parameters = {names[key]: data for key, data in self._before.items() if key in names}
         others = {key: data for key, data in self._before.items() if key not in names}
         changed = {n: data for n, data in parameters.items() if self._drive.parameters.read([n])[n] != data}
+        self._sure |= {drive_map.address(name) for name in parameters.keys() - changed.keys()}
         lines: list[str] = []
         if changed:
             try:
                 self._drive.replace(changed)
                 back |= {drive_map.address(name) for name in changed}
+                self._sure |= back
             except VerifyMismatch as mismatch:  # the limits must get their content all the same
                 lines += mismatch.differences
             except DriveFault as fault:
@@ -83,6 +92,8 @@ class ChangedObjects:
                     back.add((index, sub))
                 if self._read(index, sub) != data:
                     lines.append(f"0x{index:04X}:{sub:02X} does not hold {data[:8].hex(' ')} again")
+                else:
+                    self._sure.add((index, sub))
             except SdoAbort as abort:
                 if index == objects.MODE.index:
                     continue  # the mode a drive wakes up with, which some take from nobody; it is off by now

@@ -168,6 +168,11 @@ class GuardedDrive:
                 self._drive.disable_at_once()
         return interrupted
 
+    @property
+    def left(self) -> list[str]:
+        """Addresses of changed objects that are not known to hold their old content again."""
+        return self._changed.left
+
     def restore(self) -> int:
         """Bring every changed object back to what it held, read it back, end the heartbeat.
 
@@ -554,11 +559,12 @@ def _restored(guard: GuardedDrive) -> int:
     except StopNotConfirmed:
         raise
     except (BusError, DriveFault) as error:
-        raise _not_restored(error) from error
+        raise _not_restored(error, guard.left) from error
 
 
-def _not_restored(error: PmsmtoolError) -> PmsmtoolError:
-    error.what = f"{error.what}; the machine is stopped, but the drive could not be restored"
+def _not_restored(error: PmsmtoolError, left: list[str]) -> PmsmtoolError:
+    named = f": {', '.join(left)} may hold values of this run until its next reset" if left else ""
+    error.what = f"{error.what}; the machine is stopped, but the drive could not be restored{named}"
     error.args = (error.what,)
     error.hint = error.hint or "reset the drive: it comes back with what it has stored"
     return error
