@@ -61,11 +61,6 @@ class Move:
         """Largest speed (rad/s)."""
         return abs(self.distance) / self.t_speed if self.t_speed else 0.0
 
-    @property
-    def peak_acceleration(self) -> float:
-        """Largest acceleration (rad/s2)."""
-        return self.peak_speed / self.t_acceleration if self.t_acceleration else 0.0
-
     def at(self, t_s: Array) -> tuple[Array, Array, Array]:
         """Return angle (rad), speed and acceleration at times from the begin of the move (s)."""
         if not self.distance:

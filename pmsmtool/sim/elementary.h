@@ -15,7 +15,6 @@
 
 #define PMSM_REAL64_PI 3.14159265358979323846
 #define PMSM_REAL64_TWO_PI 6.28318530717958647693
-#define PMSM_REAL64_SQRT3 1.73205080756887729353
 
 /* Arguments beyond this are reduced with a visible error; electrical angles stay below 64 pi. */
 #define PMSM_REAL64_SINCOS_MAX 1.0e6

@@ -164,8 +164,8 @@ def build_setup(
     violations: list[str] = []
     setup = Setup()
     keep = _machine(setup.machine, machine_file, settings, violations)
-    _inverter(setup.inverter, machine_file, settings, violations)
-    _sensors(setup.sensors, machine_file, settings, violations)
+    _inverter(setup.inverter, settings, violations)
+    _sensors(setup.sensors, settings, violations)
     _timing(setup, machine_file, settings, violations)
     setup.U_dc, setup.load = settings.number("U_dc_v"), settings.number("load_nm")
     setup.U_dc_ripple, setup.U_dc_ripple_hz = settings.number("U_dc_ripple_v"), settings.number("U_dc_ripple_hz")
@@ -247,7 +247,7 @@ def _mechanics(out: Any, settings: Settings, violations: list[str]) -> None:
         violations.append("J_load_kgm2 needs coupling_stiffness_nm_per_rad")
 
 
-def _inverter(out: Any, machine_file: MachineFile, settings: Settings, violations: list[str]) -> None:
+def _inverter(out: Any, settings: Settings, violations: list[str]) -> None:
     dead, mismatch = settings.number("dead_time_s"), settings.number("leg_mismatch_s")
     out.model, out.shape = MODELS.index(settings.text("inverter_model")), SHAPES.index(settings.text("deadtime_shape"))
     out.dead_time[:] = [dead + mismatch, dead - mismatch, dead]
@@ -271,7 +271,7 @@ def _inverter(out: Any, machine_file: MachineFile, settings: Settings, violation
             violations.append(f"output_capacitance_f below {least:.2g} F is not resolved; write 0 for none")
 
 
-def _sensors(out: Any, machine_file: MachineFile, settings: Settings, violations: list[str]) -> None:
+def _sensors(out: Any, settings: Settings, violations: list[str]) -> None:
     out.gain[:] = [settings.number(f"sensor_gain_{phase}") for phase in "abc"]
     out.offset[:] = [settings.number(f"sensor_offset_{phase}_apk") for phase in "abc"]
     out.noise = settings.number("sensor_noise_apk")
