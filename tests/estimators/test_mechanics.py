@@ -137,9 +137,26 @@ def test_an_inertia_by_means_alone_is_near_and_says_how_near(direction: int) -> 
         traces = [replace(t, signals={**t.signals, "theta_M_rad": -t["theta_M_rad"]}) for t in traces]
     found = mean_inertia(traces, lambda i_d, i_q: PER_A * i_q, 0.03, direction)
     assert found is not None and found.value == pytest.approx(J, rel=0.02)  # 0.3 %
-    assert found.std == pytest.approx(0.05 * found.value) and found.n == len(traces)
+    assert found.std == pytest.approx(0.05 * found.value, rel=0.01) and found.n == len(traces)
     assert found.systematic == pytest.approx(SensorTolerance().inertia * found.value)
     assert mean_inertia(traces, lambda i_d, i_q: -PER_A * i_q, 0.03, direction) is None, "it turns against its torque"
+
+
+@pytest.mark.chain
+def test_a_shaft_that_has_come_to_rest_is_in_no_mean_acceleration() -> None:
+    """Friction had stopped a light one after 15 % of its record: J was 18 % too large, at +-8 %."""
+    traces = run_of(np.random.default_rng(3), (J, B, 6.0 * TAU_C))
+
+    def resting(run: Trace) -> Trace:
+        count = 8 * ROWS if run.meta["coasting"] else 0
+        stopped = run["theta_M_rad"][-1]
+        t = np.append(run.t_s, run.t_s[-1] + run.period_s * np.arange(1, count + 1))
+        tail = {name: np.full(count, stopped if name == "theta_M_rad" else 0.0) for name in run.signals}
+        return replace(run, t_s=t, signals={name: np.append(run[name], tail[name]) for name in run.signals})
+
+    found = mean_inertia([resting(run) for run in traces], lambda i_d, i_q: PER_A * i_q, 0.03, 1)
+    assert found is not None and found.value == pytest.approx(J, rel=5e-3)  # measured 4e-4; with the rest 8.5 %
+    assert found.std < 0.051 * found.value  # with it 0.055
 
 
 @pytest.mark.chain
@@ -234,6 +251,7 @@ def test_pushes_are_sized_by_speed_and_time() -> None:
     assert plan.unit_s == pytest.approx(2e-3 * 100.0 / 3.6) and plan.i_q_a == 4.0 and plan.omega_rad_s == 100.0
     quick = plan_mechanics(4.0, 100.0, 2e-5, 0.9)
     assert quick.unit_s == UNIT_LEAST_S and quick.i_q_a < 4.0 and quick.omega_rad_s == 100.0
+    assert quick.i_most_a == plan.i_most_a == 4.0
     assert 0.9 * quick.i_q_a * quick.unit_s / 2e-5 == pytest.approx(100.0)
     heavy = plan_mechanics(4.0, 100.0, 2.0, 0.9)
     assert heavy.unit_s == UNIT_MOST_S and heavy.omega_rad_s < 100.0

@@ -276,14 +276,14 @@ def mean_inertia(
     Whatever swings or strikes within them is in neither mean. Parameters as of :func:`estimate_mechanics`; None where
     it finds no inertia.
     """
-    runs = [_window(run) for run in runs]
+    runs = [_fast(_fast(_window(run))) for run in runs]  # the second time without a long rest
     step = encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, 0.0, 0.0, direction, step, NO_HARMONICS, 0.0)[1] for run in runs]
-    try:
-        J = math.exp(float(_start(blocks)[0]))
-    except IdentificationError:
+    found, J_std, _ = _mean_motion(blocks)
+    J = float(found[0])
+    if not J > 0.0:
         return None
-    std = J * math.hypot(MEAN_STD, scale_std)
+    std = math.hypot(J_std, J * math.hypot(MEAN_STD, scale_std))
     return Estimate(J, std, (tolerance or SensorTolerance()).inertia * J, "kg m2", n=len(runs), method=MEAN_METHOD)
 
 
@@ -390,6 +390,14 @@ def _blocks(
 
 def _start(runs: Sequence[Run]) -> Array:
     """Return ln J, B, tau_c and each trace's first position and speed, from a regression of torque on motion."""
+    x, _, states = _mean_motion(runs)
+    if not x[0] > 0.0:
+        raise refuse("E_NOT_IDENTIFIABLE", f"J = {x[0]:.3g} kg m2", stage=STAGE, likely="the shaft is held or driven")
+    return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
+
+
+def _mean_motion(runs: Sequence[Run]) -> tuple[Array, float, list[float]]:
+    """Return J, B, tau_c of the mean torques and motions of half traces, the deviation of J, and the first states."""
     rows, torques, states = [], [], []
     for run in runs:
         t = run.T * np.arange(len(run.theta))
@@ -401,10 +409,8 @@ def _start(runs: Sequence[Run]) -> Array:
             torques.append(float(np.mean(run.torque[part])))
         first = np.polyfit(t[: len(t) // 4], run.theta[: len(t) // 4], 2)
         states += [run.theta[0], float(first[1])]
-    x, _, _, _ = linear_solve(np.array(rows), np.array(torques), np.ones(len(rows)))
-    if not x[0] > 0.0:
-        raise refuse("E_NOT_IDENTIFIABLE", f"J = {x[0]:.3g} kg m2", stage=STAGE, likely="the shaft is held or driven")
-    return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
+    x, covariance, residual, _ = linear_solve(np.array(rows), np.array(torques), np.ones(len(rows)))
+    return x, math.sqrt(float(covariance[0, 0] * (residual @ residual)) / (len(rows) - len(x))), states
 
 
 def _fit(runs: Sequence[Run], start: Array, elastic: bool) -> tuple[Fit, float, Sequence[Run]]:
