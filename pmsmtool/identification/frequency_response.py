@@ -5,17 +5,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.frequency_response import (
     INFORMATION_GAIN,
     FrequencyResponse,
     estimate_frequency_response,
 )
+from pmsmtool.estimators.shaft.response_lines import STAGE
 from pmsmtool.identification.mechanics import in_frame, torque_doubt, torque_of
+from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.npz_file import npz_bytes
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.trace import Trace
@@ -54,12 +58,27 @@ def frequency_response_of(
     parts = [traces[f"{TRACE}{k}"] for k in range(sum(name.startswith(TRACE) for name in traces))]
     if not parts or result.flux is None or result.encoder is None or result.offset is None:
         return None
+    asked_a = float(parts[0].meta["excitation"]["amplitude"])
+    seen_a = min(float(np.std(part["i_q_a"])) for part in parts)
+    if seen_a > asked_a:
+        raise refuse(
+            "E_EXCITATION",
+            f"the current scatters by {seen_a:.2g} A beside a random sequence of {asked_a:.2g} A: the response of "
+            "torque and motion is then not that of the shaft",
+            stage=STAGE,
+            likely="a light shaft with cogging, whose back-EMF moves the current, or a small motor for this drive",
+        )
     behind = result.offset.value - float(parts[0].meta["offset_rad"])
+    pole_pairs = round(result.encoder.pole_pairs.value)
+    known = result.mechanics
+    cogging = None if known is None else partial(known.harmonics.torque_nm, J_kgm2=known.J.value)
     return estimate_frequency_response(
         [in_frame(part, behind) for part in parts],
-        torque_of(result, round(result.encoder.pole_pairs.value)),
+        torque_of(result, pole_pairs),
         direction=int(parts[0].meta["direction"]),
         scale_std=_doubt(parts[0], result, dead_time_s),
+        noise_nm=torque_per_ampere(pole_pairs, result.flux.psi_measured.value) * result.noise.sigma_a,
+        over_angle=cogging,
         tolerance=tolerance,
     )
 

@@ -97,6 +97,38 @@ def estimate(traces: Sequence[Trace]) -> FrequencyResponse:
     return estimate_frequency_response(traces, lambda i_d, i_q: PER_A * i_q)
 
 
+def test_noise_of_the_current_is_no_fall_of_the_response() -> None:
+    """A rigid shaft behind a slow loop, whose current is mostly noise at 100 Hz, looked like two masses."""
+    rng, noise_a = np.random.default_rng(4), 0.15
+    traces = [
+        replace(run, signals={**run.signals, "i_q_a": run["i_q_a"] + noise_a * rng.standard_normal(ROWS)})
+        for run in records(2e-3, 3, level_a=0.3)
+    ]
+    torque = lambda i_d, i_q: PER_A * i_q  # noqa: E731
+    known = estimate_frequency_response(traces, torque, noise_nm=PER_A * math.hypot(noise_a, 0.005))
+    plain = estimate_frequency_response(traces, torque)
+    assert plain.information_gain > 10.0 and known.information_gain < 0.0  # measured 127 and -74
+    assert known.inertia is not None and known.inertia.value == pytest.approx(2e-3, rel=0.03)  # 1.7 %
+    assert plain.inertia is not None and plain.inertia.value > 1.2 * known.inertia.value
+    assert plain.frequency_hz[-1] > known.frequency_hz[-1], "where the torque is noise there is no response"
+    with pytest.raises(IdentificationError, match="E_COHERENCE"):
+        estimate_frequency_response(traces, torque, noise_nm=PER_A)
+
+
+def test_a_cogging_that_is_known_moves_the_shaft_with_the_current() -> None:
+    def cogging(theta: Array) -> Array:
+        return np.asarray(0.4 * np.cos(24.0 * theta + 1.0))
+
+    traces = [
+        replace(run, signals={**run.signals, "i_q_a": run["i_q_a"] - cogging(run["theta_M_rad"]) / PER_A})
+        for run in records(2e-3, 6)
+    ]
+    torque = lambda i_d, i_q: PER_A * i_q  # noqa: E731
+    known = estimate_frequency_response(traces, torque, over_angle=cogging)
+    assert known.chi2_rigid < 1.2 < 1.3 < estimate(traces).chi2_rigid  # measured 1.03 and 1.38
+    assert known.inertia is not None and known.inertia.value == pytest.approx(2e-3, rel=2e-3)
+
+
 def shaken(trace: Trace, amplitude: float, frequency_hz: float, phase: float) -> Trace:
     """The trace with a motion that no torque made."""
     motion = amplitude * np.sin(2.0 * math.pi * frequency_hz * trace.t_s + phase)

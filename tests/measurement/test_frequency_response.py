@@ -7,6 +7,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,14 +16,14 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.errors import NotAvailable
+from pmsmtool.errors import IdentificationError, NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.experiments.frequency_response import keep_speed, plan_frequency_response
 from pmsmtool.identification.by_injection import RESONANCE
-from pmsmtool.identification.frequency_response import RESPONSE_FILE
+from pmsmtool.identification.frequency_response import RESPONSE_FILE, frequency_response_of
 from pmsmtool.identification.mechanics import (
     ELASTIC_FALLBACK,
     MEAN_FALLBACK,
@@ -42,6 +43,7 @@ from pmsmtool.measurement.frequency_response import PLAN_LINE
 from pmsmtool.measurement.identify import identify
 from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.trace import Trace
 
 J, J_LOAD, STIFFNESS, DAMPING = 0.006, 0.009, 2000.0, 0.02
 SPRING = {
@@ -244,3 +246,13 @@ def test_no_notch_without_a_resonance_and_none_beyond_the_speed_controller() -> 
 def test_a_held_rotor_has_no_frequency_response() -> None:
     with pytest.raises(NotAvailable, match="frf"):
         IdentifyRequest(("frf",), shaft="locked").check()
+
+
+def test_a_current_that_follows_the_shaft_is_no_excitation() -> None:
+    """1 mA of random current beside 5 mA that cogging made by the back-EMF: 26 g cm2 where there were 12."""
+    rows = np.random.default_rng(1).standard_normal(400)
+    signals = {"i_d_a": 0.0 * rows, "i_q_a": 5e-3 * rows, "theta_M_rad": 0.01 * np.arange(400.0)}
+    record = Trace(1e-3 * np.arange(400.0), signals, dict.fromkeys(signals, "1"), {"excitation": {"amplitude": 1e-3}})
+    with pytest.raises(IdentificationError, match="E_EXCITATION") as refused:
+        frequency_response_of({"frf_0": record}, SimpleNamespace(flux=1, encoder=1, offset=1))  # type: ignore[arg-type]
+    assert "cogging" in str(refused.value.likely)

@@ -28,7 +28,7 @@ from pmsmtool.arrays import Array, Complex
 from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, information_bound, scaled_covariance
 from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, STAGE, local_polynomials, transforms
+from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, STAGE, local_polynomials, transforms, without_noise
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
@@ -142,6 +142,8 @@ def estimate_frequency_response(
     *,
     direction: int = 1,
     scale_std: float = 0.0,
+    noise_nm: float = 0.0,
+    over_angle: Callable[[Array], Array] | None = None,
     tolerance: SensorTolerance | None = None,
 ) -> FrequencyResponse:
     """Estimate the response, the inertia, and the resonance where there is one.
@@ -156,6 +158,10 @@ def estimate_frequency_response(
         Sign of the encoder's count along the phase order.
     scale_std : float
         Relative standard deviation of the torque's scale, which goes into the inertia one to one.
+    noise_nm : float
+        Standard deviation of the torque's samples by the noise of the measured currents (N m).
+    over_angle : callable, optional
+        Cogging (N m) of an array of angles along the phase order: it moves the shaft, too.
     tolerance : SensorTolerance
         Declared sensor tolerances.
 
@@ -173,7 +179,12 @@ def estimate_frequency_response(
     flagged = sum(int(np.sum(run["flagged"] > 0.0)) for run in runs)
     if flagged:
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
-    omega, U, Y, T = transforms(runs, torque, direction)
+    torques = [torque(run["i_d_a"], run["i_q_a"]) for run in runs]
+    if over_angle is not None:
+        torques = [tau + over_angle(direction * run["theta_M_rad"]) for tau, run in zip(torques, runs, strict=True)]
+    omega, U, Y, T = transforms(runs, torques, direction)
+    U = without_noise(U, (len(runs[0]) - 2) * noise_nm**2)
+    omega, Y = omega[: U.shape[1]], Y[:, : U.shape[1]]
     G, sigma, std, coherence = local_polynomials(U, Y)
     inner = slice(HALF_WIDTH, len(omega) - HALF_WIDTH)
     omega, U, Y = omega[inner], U[:, inner], Y[:, inner]

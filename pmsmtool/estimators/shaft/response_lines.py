@@ -8,7 +8,7 @@ Schoukens, System Identification, 2nd ed. 2012, chapter 7, DOI 10.1002/978111828
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -23,12 +23,15 @@ HIGHEST_SHARE = 0.2
 HALF_WIDTH = 3
 """Lines on each side of one that its polynomials use."""
 ORDER = 2
+SHARE_LEAST = 0.5
+"""Share of the measured torque's power that is no noise, where the band ends: noise that is 10 % more than at rest
+leaves 10 % of a response there."""
 LINES_LEAST = 40
 """Lines below which a record is too short."""
 
 
 def transforms(
-    runs: Sequence[Trace], torque: Callable[[Array, Array], Array], direction: int
+    runs: Sequence[Trace], torques: Sequence[Array], direction: int
 ) -> tuple[Array, Complex, Complex, float]:
     """Return frequency (rad/s), transforms of torque and acceleration in the band, and the period of rows."""
     T = runs[0].period_s
@@ -37,8 +40,8 @@ def transforms(
     first = int(np.searchsorted(frequency, LOWEST_HZ))
     band = slice(max(HALF_WIDTH + 1, first), int(np.searchsorted(frequency, HIGHEST_SHARE / T)))
     U, Y = [], []
-    for run in runs:
-        tau = torque(run["i_d_a"], run["i_q_a"])[1:-1]
+    for run, torque in zip(runs, torques, strict=True):
+        tau = torque[1:-1]
         U.append(np.fft.rfft(tau - np.mean(tau))[band])
         Y.append(np.fft.rfft(direction * np.diff(run["theta_M_rad"], 2) / T**2)[band])
     omega: Array = np.asarray(2.0 * math.pi * frequency[band], dtype=np.float64)
@@ -46,6 +49,35 @@ def transforms(
         raise refuse("E_EXCITATION", f"records of {n * T:.3g} s give {len(omega)} lines", stage=STAGE)
     # the second difference of a position is the acceleration over a triangle of two rows
     return omega, np.array(U), np.array(Y) / np.sinc(0.5 * omega * T / math.pi) ** 2, T
+
+
+def without_noise(U: Complex, power: float) -> Complex:
+    """Return of measured lines what their noise lets expect of the true ones, up to the last that is no noise.
+
+    Noise of the input makes a response too small where the input is weak, and its fall with the frequency looks like a
+    second mass: with S + N measured, S/(S + N) of a line is expected (regression calibration; Carroll et al.,
+    Measurement Error in Nonlinear Models, 2nd ed. 2006, chapter 4).
+
+    Parameters
+    ----------
+    U : ndarray, shape (records, lines)
+        Transforms of the measured torque.
+    power : float
+        Mean squared magnitude of a line's noise.
+    """
+    mean = np.mean(np.abs(U) ** 2, axis=0)
+    around = np.ones(2 * HALF_WIDTH + 1)
+    smooth = np.convolve(mean, around, "same") / np.convolve(np.ones_like(mean), around, "same")
+    share = 1.0 - power / smooth
+    clear = np.flatnonzero(share >= SHARE_LEAST)
+    if len(clear) < LINES_LEAST + 2 * HALF_WIDTH:
+        raise refuse(
+            "E_COHERENCE",
+            f"the torque is above the noise of its current on {len(clear)} of {len(mean)} lines, "
+            f"{LINES_LEAST + 2 * HALF_WIDTH} are needed",
+            stage=STAGE,
+        )
+    return np.asarray((U * np.maximum(share, SHARE_LEAST))[:, : int(clear[-1]) + 1])
 
 
 def local_polynomials(U: Complex, Y: Complex) -> tuple[Complex, Array, Array, Array]:
