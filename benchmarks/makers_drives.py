@@ -143,8 +143,9 @@ def asked(*words: str) -> tuple[int, dict[str, Any], str]:
     error = outcome.exception
     facts = json.loads(outcome.stdout) if outcome.stdout.startswith("{") else {}
     if isinstance(error, PmsmtoolError):
-        lines = [line.strip(" -") for line in error.what.splitlines()]
-        reason = next((line for line in lines if line.startswith("mechanics by standard")), lines[0])
+        lines = [line.strip(" -") for line in str(error).splitlines()]
+        first = error.what.splitlines()[0]
+        reason = next((line for line in lines if "mechanics by standard" in line), first)
         return error.exit_code, facts, reason
     return outcome.exit_code, facts, "" if outcome.exit_code in (0, 10) else repr(error)
 
