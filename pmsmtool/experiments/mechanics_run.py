@@ -118,7 +118,7 @@ def push_and_coast(drive: Drive, plan: MechanicsPlan, abort_speed_rad_s: float, 
     coasting = _coast(drive, plan)
     for _ in range(STRONGER_TRIES):
         reached = abs(_speed(first))
-        stopped = abs(_speed(coasting)) < SHORT * reached
+        stopped = abs(_speed(coasting)) <= SHORT * reached
         if plan.i_q_a >= plan.i_most_a or not stopped or reached >= SHORT * plan.omega_rad_s:
             break
         plan = plan.stronger(reached)
@@ -139,7 +139,7 @@ def push_and_coast(drive: Drive, plan: MechanicsPlan, abort_speed_rad_s: float, 
     # what the first push really did decides how long the other one may be: the plan's inertia is a rough one
     both = min(2.0 * reached, reached + left, 2.0 * plan.omega_rad_s)
     drive.enable()
-    back_s = plan.unit_s * both / max(reached, 0.1 * plan.omega_rad_s)
+    back_s = max(plan.unit_s, plan.unit_s * both / max(reached, 0.1 * plan.omega_rad_s))
     keep(_push(drive, -plan.i_q_a, back_s, plan.rows, abort_speed_rad_s))
     keep(_coast(drive, plan))
 

@@ -197,7 +197,7 @@ def of_no_rigid_shaft(
     if response is not None and small is not None:
         check = cross_check("J_kgm2", "J_kgm2", small, whole)
         if check.agrees and found is None:
-            return None, None, response
+            return None, replace(whole, fallback=MEAN_FALLBACK) if whole.std < small.std else None, response
         if not check.agrees:
             both = f"{small.value:.3g} kg m2 by a small torque, {whole.value:.3g} by pulses"
             response = replace(response, found={}, inertia=None, reason=f"the shaft has play, or is not linear: {both}")

@@ -204,6 +204,9 @@ def test_pushes_that_tell_another_inertia_are_believed_only_where_a_small_torque
     assert lighter is nowhere is None and doubted is not None and doubted.inertia is None
     assert of_no_rigid_shaft(Pushed(0.0, 0.0), response) == (None, None, response)
     assert of_no_rigid_shaft(Pushed(0.0, 0.0165), response) == (None, None, response), "the response is the finer one"
+    rough = replace(response, inertia=Estimate(0.016, 3e-3, 0.0, "kg m2"))
+    _, mean, kept = of_no_rigid_shaft(Pushed(0.0, 0.0165), rough)
+    assert mean is not None and mean.value == 0.0165 and mean.fallback == MEAN_FALLBACK and kept is rough
     _, mean, beside = of_no_rigid_shaft(Pushed(0.0, 0.0320), response)
     assert mean is not None and mean.fallback.startswith(PLAY_FALLBACK) and beside is not None and not beside.inertia
     _, mean, none = of_no_rigid_shaft(Pushed(0.0, 0.0320), None)
