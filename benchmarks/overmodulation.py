@@ -4,7 +4,7 @@
 Run from the repository: ``python benchmarks/overmodulation.py [--machines 24] [--seed 1]``; some seconds per machine.
 Machines of ``default_governor.py`` (linear and salient) with a drawn minimum low-side time and sampling window, each
 with sensors in the phases, three shunts and one, designed by ``tune`` with the largest utilisation. The currents are
-held while the speed is raised until they need 0.90 to 0.98 (0.995 without governor) of the largest fundamental, and
+held while the speed is raised until they need 0.90 to 0.98 (0.985 without governor) of the largest fundamental, and
 lowered again, 20 speeds each way; delay 1.5 periods, ideal sensors.
 
 Printed per kind and shunts: largest fundamental over the linear limit, its largest error against the core's own
@@ -37,8 +37,9 @@ from pmsmtool.machine.parameters import InverterParameters
 from tests.firmware.closed_loop import DEFAULTS, MODE_CURRENT, Loop
 
 SHUNTS = (0, 3, 1)
-SHARES = {"best": np.linspace(0.90, 0.98, 20), "off": np.linspace(0.90, 0.995, 20)}
-"""Of the largest fundamental, by governor: it holds references back that need more than 1 - eps of it, 0.985."""
+SHARES = {"best": np.linspace(0.90, 0.98, 20), "off": np.linspace(0.90, 0.985, 20)}
+"""Of the largest fundamental, by governor: it holds references back that need more than 1 - eps of it, 0.985. A voltage
+above 0.99 (1.005 without governor) is taken for a step."""
 TURNS, SETTLE_PERIODS = 24, 400
 FUNDAMENTAL_ERROR = 0.01
 """Measured: 0.006, of a dozen samples per edge of the hexagon; 0.0003 in the mean over all angles (a test)."""

@@ -93,7 +93,7 @@ void pmsm_modulate(pmsm_period *period, pmsm_output *output)
     const uint32_t options = period->params->current_options;
     const pmsm_derived *derived = &period->state->derived;
     const pmsm_dq limited = (derived->hexagon != 0u) ? period->u : limit_to_circle(period, period->u);
-    uint32_t beyond = 0u; /* the linear range */
+    uint32_t beyond = PMSM_BEYOND_NOT; /* the linear range */
     const pmsm_dq made = (derived->overmodulates != 0u) ? pmsm_lengthen(period, limited, &beyond) : limited;
     pmsm_ab stator = pmsm_park_inverse(made, period->sine_out, period->cosine_out);
     const pmsm_abc wanted = pmsm_clarke_inverse(stator);
@@ -108,7 +108,7 @@ void pmsm_modulate(pmsm_period *period, pmsm_output *output)
                                   period->U_dc * output->duty_c - error.c};
         stator = pmsm_clarke(applied);
         period->flags |= (uint32_t)PMSM_FLAG_DUTY_CLIPPED;
-        if (beyond != 0u) { /* the fundamental is what was asked for: the controllers see that */
+        if (beyond == PMSM_BEYOND_HELD) { /* the fundamental is what was asked for: the controllers see that */
             stator = pmsm_part_harmonics(period, limited, stator);
         } else {
             period->u_realised = pmsm_park(stator, period->sine_out, period->cosine_out);

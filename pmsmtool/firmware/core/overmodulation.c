@@ -11,6 +11,10 @@
 #define DUTY_LEAST PMSM_C(0.5) /* of what is left: a set may hold any times */
 #define SECOND_LEAST PMSM_C(0.6)
 #define APART_MOST PMSM_C(0.4)
+/* Of V_max: a demand above belongs to a step, and what the legs cut off is no harmonic. A governor puts steps on V_max,
+ * and what is held 1.5 % below; without one a step demands more. */
+#define HELD_GOVERNED PMSM_C(0.99)
+#define HELD_FREE PMSM_C(1.005)
 
 /* What minimum low-side time and shunts leave of the duties, and of the hexagon's edges. */
 void pmsm_prepare_duties(pmsm_derived *derived, const pmsm_params *params)
@@ -35,6 +39,8 @@ void pmsm_prepare_duties(pmsm_derived *derived, const pmsm_params *params)
         low = PMSM_C(1.0) - PMSM_C(2.0) * derived->duties_apart / derived->duty_most;
         high = low;
     }
+    const uint32_t mode = params->governor_mode;
+    derived->held_share = (mode != PMSM_GOVERNOR_OFF && mode != PMSM_GOVERNOR_OBSERVE) ? HELD_GOVERNED : HELD_FREE;
     derived->side_low = low / PMSM_SQRT3;
     derived->side_high = high / PMSM_SQRT3;
     derived->over_most = SIX_STEPS_FLAT + SIX_STEPS_SIDE * (low + high);
@@ -79,9 +85,11 @@ pmsm_dq pmsm_lengthen(const pmsm_period *period, pmsm_dq u, uint32_t *beyond)
     const pmsm_derived *derived = &period->state->derived;
     const pmsm_real radius = derived->utilisation_linear * period->U_dc;
     const pmsm_real square = pmsm_square(u);
+    const pmsm_real held = derived->held_share * period->V_max;
     if (square <= LINEAR_MARGIN * radius * radius || radius <= PMSM_C(0.0)) {
         return u;
     }
+    *beyond = (pmsm_square(period->u) > held * held) ? PMSM_BEYOND_IN_STEP : PMSM_BEYOND_HELD;
     const pmsm_real fundamental = PMSM_SQRT(square) / radius;
     const pmsm_real excess = fundamental - PMSM_C(1.0);
     const pmsm_real left = derived->over_most - fundamental;
@@ -91,7 +99,6 @@ pmsm_dq pmsm_lengthen(const pmsm_period *period, pmsm_dq u, uint32_t *beyond)
     ratio = pmsm_clamp(improved(derived, ratio, fundamental), RATIO_LEAST, PMSM_C(1.0));
     const pmsm_real scale = PMSM_C(1.0) / (ratio * fundamental);
     const pmsm_dq longer = {u.d * scale, u.q * scale};
-    *beyond = 1u;
     return longer;
 }
 

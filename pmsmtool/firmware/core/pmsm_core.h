@@ -122,6 +122,7 @@ typedef struct {             /* constants of the active set, computed in the fir
     pmsm_real utilisation_linear; /* V_max / U_dc up to which a demand is what the legs make */
     pmsm_real side_low;      /* half of an edge of the hexagon that the second leg may use, over the inscribed radius */
     pmsm_real side_high;
+    pmsm_real held_share;    /* of V_max, above which a demand belongs to a step */
     pmsm_real over_most;     /* largest fundamental over that of the linear range, and how it is approached */
     pmsm_real over_rate;
     uint32_t shunts;         /* that these duties are for */

@@ -102,7 +102,8 @@ enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, p
 void pmsm_polar_demand(pmsm_period *period);
 void pmsm_polar_settle(pmsm_period *period);
 
-/* overmodulation.c; *beyond becomes 1 where u is outside the linear range */
+/* overmodulation.c; *beyond tells where u is outside the linear range */
+enum pmsm_beyond { PMSM_BEYOND_NOT = 0, PMSM_BEYOND_IN_STEP, PMSM_BEYOND_HELD };
 void pmsm_prepare_duties(pmsm_derived *derived, const pmsm_params *params);
 pmsm_dq pmsm_lengthen(const pmsm_period *period, pmsm_dq u, uint32_t *beyond);
 uint32_t pmsm_make_readable(const pmsm_derived *derived, uint32_t beyond, pmsm_abc wanted, pmsm_output *output);
