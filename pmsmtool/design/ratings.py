@@ -260,14 +260,15 @@ def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
 
 
 def sag_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict[str, float]:
-    """Return the share of the largest torque that a sagged link leaves, at base speed and at the largest speed."""
+    """Return the torque share that a sagged link leaves at base and largest speed, and overmodulation's current."""
     plane, facts = at_temperature(source.machine, source.flux_map), {}
     for where, rpm in (("base_speed", rated.base_speed_rpm), ("n_max", rated.n_max_rpm)):
         V = [SAG_SHARE * V_limit_v, V_limit_v]
         found = torque_limits(plane, [rpm / RPM * plane.pole_pairs], V, rated.I_max_apk, rated.i_d_min_a)
         sagged, full = (float(x) for x in np.nan_to_num(found.largest_nm[0]))
         facts[f"sag_torque_share_{where}"] = max(sagged, 0.0) / full if full > 0.0 else 0.0
-    return facts
+    harmonic = source.inverter.harmonic_flux_wb(rated.base_speed_rpm / RPM * plane.pole_pairs)
+    return facts if harmonic == 0.0 else {**facts, "overmodulation_harmonic_apk": harmonic / source.machine.L_d_h}
 
 
 def _encoder(source: MachineFile) -> dict[str, DesignValue]:

@@ -120,6 +120,10 @@ SIX_STEPS_MIDDLE, SIX_STEPS_HALF_EDGE = 3.0 / math.pi, (math.sqrt(3.0) - 1.5) / 
 """Fundamental of six steps over the linear limit: of the middles of the hexagon's edges, and of half an edge."""
 
 
+SIX_STEPS_HARMONIC = math.pi**2 / 9.0 - 1.0
+"""Farthest that the flux of six steps, a hexagon, is from its fundamental, over that: at the corners."""
+
+
 @dataclass(frozen=True, slots=True)
 class InverterParameters:
     """Inverter and timing (``[inverter]`` of a machine file).
@@ -167,6 +171,10 @@ class InverterParameters:
     def linear_utilisation(self) -> float:
         """Voltage utilisation up to which the voltages are sinusoidal."""
         return LINEAR_UTILISATION * (1.0 - (self.min_off_time_s or 0.0) * self.f_s_hz)
+
+    def harmonic_flux_wb(self, omega_e_rad_s: float) -> float:
+        """Largest flux (Wb) of the harmonics that overmodulation adds at a speed; 0 without (docs/control.md, 8)."""
+        return SIX_STEPS_HARMONIC * self.V_max_v / omega_e_rad_s if self.overmodulates else 0.0
 
     def shunt_values(self) -> dict[str, float]:
         """Parameters ``inverter.*`` of the low-side times (ns) and the shunts; 0 where nothing is stated."""

@@ -13,6 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pmsmtool.design.ratings import ratings
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.core_binding import core
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file, parse_machine
@@ -195,3 +198,23 @@ def test_without_it_a_minimum_time_lowers_the_linear_limit() -> None:
         parse_machine(fast.replace("[inverter]\n", "[inverter]\nmin_off_time_s = 2e-5\n"))
     assert "more than half of a period" in long.value.violations[0]
     assert not machine().inverter.overmodulates
+
+
+def test_a_design_says_how_large_the_harmonic_current_gets() -> None:
+    """Against the flux of six steps, integrated here: a hexagon, less its fundamental."""
+    source = machine(voltage_utilisation=0.62, shunts=0, min_off_time_s=0.0, sample_window_s=0.0)
+    told = tune(source).facts["overmodulation_harmonic_apk"]
+    assert "overmodulation_harmonic_apk" not in tune(machine()).facts
+    n, omega = 6000, rated_base_speed(source)
+    angle = (np.arange(n) + 0.5) * 2.0 * math.pi / n
+    steps = np.exp(1j * math.pi / 3.0 * np.round(angle / (math.pi / 3.0)))
+    steps *= source.inverter.V_max_v / abs(np.mean(steps * np.exp(-1j * angle)))
+    harmonic = steps - np.mean(steps * np.exp(-1j * angle)) * np.exp(1j * angle)
+    flux = np.cumsum(harmonic) * 2.0 * math.pi / n / omega
+    assert told == pytest.approx(np.abs(flux - flux.mean()).max() / source.machine.L_d_h, rel=5e-3)
+
+
+def rated_base_speed(source: MachineFile) -> float:
+    """Electrical base speed (rad/s)."""
+    V = (1.0 - TuneRequest().voltage_margin) * source.inverter.V_max_v
+    return ratings(source, V).base_speed_rpm * math.pi / 30.0 * source.machine.pole_pairs
