@@ -67,7 +67,8 @@ class Evaluation:
     """What the traces of a run say; None where an experiment was not run, or is in ``refused`` with its reason.
 
     ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics``, ``frf``,
-    ``cogging`` and ``harmonics``. ``inertia`` is that by mean accelerations, where the mechanics are refused.
+    ``cogging`` and ``harmonics``. ``inertia`` is that by mean accelerations, where the mechanics are refused;
+    ``swing_hz`` is where pushes swing the shaft and no linear response does (Hz).
     ``encoder_noise_rad`` is the standard deviation of a position at rest, without what drifts (mechanical).
     ``supply_w`` is the power from which on the DC link gives way (W).
     """
@@ -84,6 +85,7 @@ class Evaluation:
     flux: FluxResult | None = None
     mechanics: MechanicsResult | None = None
     inertia: Estimate | None = None
+    swing_hz: float = 0.0
     flux_map: FluxMapResult | None = None
     frequency_response: FrequencyResponse | None = None
     cogging: Cogging | None = None
@@ -284,7 +286,8 @@ def evaluate(
     response = attempt("frf", lambda: frequency_response.frequency_response_of(traces, moving, tolerance, dead_time_s))
     if pushes is not None and "mechanics" in refused and refused["mechanics"].reason in NOT_RIGID:
         elastic, inertia, response = of_no_rigid_shaft(pushes, response)
-        moving = replace(moving, mechanics=elastic, inertia=inertia)
+        swing_hz = 0.0 if response is not None and response.found else pushes.swing_hz(response)
+        moving = replace(moving, mechanics=elastic, inertia=inertia, swing_hz=swing_hz)
         if elastic is not None:
             del refused["mechanics"]
     elif moving.mechanics is not None:

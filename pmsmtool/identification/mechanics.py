@@ -14,12 +14,13 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.cross_check import cross_check
-from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
+from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, total_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_instant_s
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR
 from pmsmtool.estimators.shaft.mechanics import POWERED, MechanicsResult, Torque, estimate_mechanics, mean_inertia
+from pmsmtool.estimators.shaft.swing import swing_of
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
 from pmsmtool.trace import Trace
@@ -107,6 +108,15 @@ class Pushes:
         """Return the inertia alone, of the mean accelerations; None where they tell none."""
         return mean_inertia(self.parts, self.torque, self.scale_std, self.direction, self.tolerance)
 
+    def swing_hz(self, response: FrequencyResponse | None) -> float:
+        """Return the frequency (Hz) at which pushes clearly swing and a response does not, else 0."""
+        resonance = None if response is None else response.found.get("resonance_hz")
+        pushed = [part for part in self.parts if not part.meta["coasting"]]
+        if not pushed:
+            return 0.0
+        claimed = () if resonance is None else (resonance.value, COVERAGE_FACTOR * resonance.std)
+        return swing_of(pushed, self.torque, *claimed)
+
 
 def pushes_of(
     traces: Mapping[str, Trace],
@@ -185,6 +195,13 @@ def of_no_rigid_shaft(
     response : FrequencyResponse or None
         It has the torque's scale in common with them.
     """
+    swing_hz = pushes.swing_hz(response)
+    if response is not None and response.found and swing_hz:
+        slow = response.found["resonance_hz"].value
+        both = f"it swings at {slow:.3g} Hz by a small torque, at {swing_hz:.3g} Hz by pulses"
+        response = replace(response, found={}, inertia=None, reason=f"play, the response depends on the torque: {both}")
+        whole = pushes.inertia()
+        return None, None if whole is None else replace(whole, fallback=f"{PLAY_FALLBACK}: {both}"), response
     small = None if response is None else response.inertia
     found = None
     if small is not None:

@@ -19,6 +19,7 @@ from pmsmtool.identification.sampling import timing_warnings
 from pmsmtool.identification.wiring import SUPPLY, WRONG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.two_masses import SWING
 from pmsmtool.run_directory import Acceptance
 from pmsmtool.units import format_estimate
 
@@ -153,6 +154,8 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions["shown_instant_s"] = evaluation.shown.value_s
     if "frf" in request.measured:
         conditions[frequency_response.SHOWN] = frequency_response.shown_of(evaluation.frequency_response)
+    if evaluation.swing_hz:
+        conditions[SWING] = evaluation.swing_hz
     if evaluation.mechanics is not None:
         if evaluation.mechanics.drag is not None:
             conditions["drag_nms2"] = evaluation.mechanics.drag.value

@@ -38,6 +38,7 @@ from pmsmtool.identification.run_files import MACHINE, PREDICTED
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.two_masses import SWING, shafts_of
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.frequency_response import PLAN_LINE
 from pmsmtool.measurement.identify import identify
@@ -188,6 +189,16 @@ class Pushed(Pushes):
         J = self.scale_std
         return Estimate(J, 0.04 * J, 0.0, "kg m2") if J else None
 
+    def swing_hz(self, response: FrequencyResponse | None) -> float:
+        return 0.0
+
+
+class Swinging(Pushed):
+    """The same, which swing at another frequency than a small torque."""
+
+    def swing_hz(self, response: FrequencyResponse | None) -> float:
+        return 140.0
+
 
 def test_pushes_that_tell_another_inertia_are_believed_only_where_a_small_torque_turns_less() -> None:
     nothing = np.zeros(0)
@@ -211,6 +222,30 @@ def test_pushes_that_tell_another_inertia_are_believed_only_where_a_small_torque
     assert mean is not None and mean.fallback.startswith(PLAY_FALLBACK) and beside is not None and not beside.inertia
     _, mean, none = of_no_rigid_shaft(Pushed(0.0, 0.0320), None)
     assert mean is not None and mean.fallback == MEAN_FALLBACK and none is None
+
+
+def test_a_resonance_that_depends_on_the_torque_is_play() -> None:
+    """A gear of 184 Hz: 31 Hz by a small torque, 140 Hz by pulses; the loop designed for 31 Hz hunted."""
+    nothing = np.zeros(0)
+    resonance = {"resonance_hz": Estimate(31.0, 0.7, 0.0, "Hz")}
+    response = FrequencyResponse(nothing, nothing.astype(complex), nothing, nothing, 800.0, 1.0, 1.0, 120.0, resonance,
+                                 inertia=Estimate(3.3e-4, 6e-5, 0.0, "kg m2"))  # fmt: skip
+    none, mean, beside = of_no_rigid_shaft(Swinging(0.0, 2.42e-4), response)
+    assert none is None and mean is not None and mean.value == 2.42e-4 and mean.fallback.startswith(PLAY_FALLBACK)
+    assert beside is not None and not beside.found and beside.inertia is None
+    assert "play, the response depends on the torque" in beside.reason and "31 Hz" in beside.reason
+    assert of_no_rigid_shaft(Pushed(0.0, 2.42e-4), response)[2] is response
+
+
+def test_a_speed_loop_bears_the_swing_of_a_shaft_with_play() -> None:
+    """Designed for one mass, the loop was unstable where the gear of 184 Hz engages (phase margin -23 degrees)."""
+    rigid = load_machine_file(machine_path("interior-2k2"))
+    swinging = replace(rigid, conditions={**rigid.conditions, SWING: 140.0})
+    plain, slow = tune(rigid, TuneRequest()), tune(swinging, TuneRequest())
+    assert 0.0 < slow["speed.K_p_nms_per_rad"] < 0.3 * plain["speed.K_p_nms_per_rad"]
+    assert slow["speed.notch_hz"] == 0.0 and slow.loops["speed"].phase_margin_deg > 40.0
+    whole, *others = shafts_of(swinging)
+    assert not whole.elastic and min(o.resonance_hz for o in others) < 140.0 < max(o.resonance_hz for o in others)
 
 
 def test_pushes_that_a_rigid_shaft_explains_show_play_where_a_small_torque_turns_less() -> None:
