@@ -99,6 +99,21 @@ def plan_frequency_response(
     return FrequencyPlan(min(i_q_a, level), omega_rad_s, hold, decimation, per_ampere)
 
 
+def linear_level(i_q_a: float, room_v: float, K_p_v_per_a: float) -> float:
+    """Return the level (A peak), or less where a bit, a step of twice that, takes more voltage than there is.
+
+    Parameters
+    ----------
+    i_q_a : float
+        Level that is asked for (A peak).
+    room_v : float
+        Voltage beside the back-EMF (V).
+    K_p_v_per_a : float
+        Proportional gain of the q current (V/A).
+    """
+    return min(i_q_a, 0.5 * room_v / K_p_v_per_a) if K_p_v_per_a > 0.0 else i_q_a
+
+
 def excite_at_speed(
     drive: Drive, plan: FrequencyPlan, pole_pairs: int, abort_speed_rad_s: float, keep: Callable[[Trace], None]
 ) -> None:

@@ -24,6 +24,8 @@ I_SHARE = 0.4
 SPEED_SHARE = 0.15
 """Steady speed, of the largest that back-emf and envelope allow: slow, for the position is recorded in binary32."""
 EMF_SHARE = 0.6
+VOLTAGE_SHARE = 0.85
+"""Voltage that a bit of the sequence may take, of the largest: where it is limited there is no response."""
 ABORT_SHARE = 0.95
 REST_S = 0.5
 """Time at zero speed before the voltage is removed."""
@@ -55,7 +57,10 @@ def measure_frequency_response(
             f"the current limit of {limits.i_max_apk:.4g} A leaves none for the sequence", hint="raise --i-max"
         )
     per_ampere = torque_per_ampere(pole_pairs, psi)
-    level, speed = limits.within_supply(level, SPEED_SHARE * largest, per_ampere)
+    speed = SPEED_SHARE * largest
+    room_v = VOLTAGE_SHARE * limits.V_max_v - pole_pairs * speed * psi
+    level = frequency_response.linear_level(level, room_v, drive.read("current.K_p_q_v_per_a"))
+    level, speed = limits.within_supply(level, speed, per_ampere)
     plan = frequency_response.plan_frequency_response(level, speed, J, per_ampere, drive.period_s)
     say(
         f"frequency response: random current of {plan.i_q_a:.3g} A at {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm, "

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.shaft.frequency_response import COHERENT, FrequencyResponse, estimate_frequency_response
-from pmsmtool.experiments.frequency_response import ROWS, WALK_SHARE, plan_frequency_response
+from pmsmtool.experiments.frequency_response import ROWS, WALK_SHARE, linear_level, plan_frequency_response
 from pmsmtool.trace import Trace
 
 pytestmark = pytest.mark.chain
@@ -272,3 +272,9 @@ def test_the_sequence_is_sized_by_the_limits_and_the_walk_of_the_speed() -> None
     longest = 0.3 + 5 * 0.15 + ROWS * DECIMATION * T_S
     walk = PER_A / 1e-4 * light.i_q_a * math.sqrt(longest * HOLD * T_S)
     assert walk == pytest.approx(WALK_SHARE * 30.0)
+
+
+def test_a_bit_of_the_sequence_takes_no_more_than_the_voltage() -> None:
+    """36 mH at 96 V/A: a bit of 3.7 A asked for 705 of 323 V, and the response was refused as clipped."""
+    assert linear_level(3.7, 250.0, 96.0) == pytest.approx(250.0 / 192.0)
+    assert linear_level(3.7, 250.0, 1.0) == 3.7 and linear_level(3.7, 250.0, 0.0) == 3.7
