@@ -16,6 +16,7 @@ from pmsmtool.identification.frequency_response import NOTHING, RIGID, SHOWN
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, MEAN_FALLBACK, PLAY_FALLBACK
 from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.machine.two_masses import SWING
 from pmsmtool.units import RAD_S_PER_RPM
 
 RPM = RAD_S_PER_RPM
@@ -327,6 +328,8 @@ def _unmodelled(design: Design) -> str:
     inertia = machine.estimates.get("J_kgm2")
     if inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK):
         return "the shaft has play, which nothing predicts"
+    if SWING in machine.conditions:
+        return "torque pulses swing the shaft as no known resonance does: play, or an elastic coupling"
     if machine.conditions.get(SHOWN, RIGID) not in (RIGID, NOTHING) and machine.machine.resonance_hz is None:
         return "the shaft is not rigid, and no resonance was found: play, or an elastic coupling with much damping"
     return ""

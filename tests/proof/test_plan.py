@@ -21,6 +21,7 @@ from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.machine.torque import iron_drag
+from pmsmtool.machine.two_masses import SWING
 from pmsmtool.proof.drawn_machine import EMF_HARMONICS, FRICTION_FACTOR, LAG_SHARES
 from pmsmtool.proof.judgement import LEAST_STEADY_ROWS
 from pmsmtool.proof.plan import LONGEST_S, RPM, SIGNALS, STEPS, WEAKENING_SLOPE, Conditions, plan_proof
@@ -101,6 +102,10 @@ def test_of_a_shaft_that_bends_in_a_way_that_nothing_tells_only_currents_are_pre
     plan = plan_proof(made, conditions(made))
     assert [e.name for e in plan.experiments] == ["q_steps", "d_steps", "unreachable"]
     assert any(line.startswith("speed step, field weakening: the shaft is not rigid") for line in plan.left_out)
+    rigid = shown(design(), "rigid")
+    swinging = replace(rigid.machine, conditions={**rigid.machine.conditions, SWING: 140.0})
+    pushed = plan_proof(replace(rigid, machine=swinging), conditions(made))
+    assert [e.name for e in pushed.experiments] == ["q_steps", "d_steps", "unreachable"]
     known = replace(made.machine.machine, resonance_hz=200.0, antiresonance_hz=100.0, resonance_zeta=0.02)
     told = replace(made, machine=replace(made.machine, machine=known))
     assert "speed_step" in [e.name for e in plan_proof(told, conditions(made)).experiments]

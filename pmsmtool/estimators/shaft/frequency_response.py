@@ -10,8 +10,9 @@ Lines, their noise and coherence come from the local polynomial method, which ta
 the response (Pintelon and Schoukens, System Identification, 2nd ed. 2012, chapter 7, DOI 10.1002/9781118287422). Both
 models are fitted to the transforms of the records with those weights; the Bayesian information criterion (Schwarz 1978,
 DOI 10.1214/aos/1176344136) decides: a second mass must explain more than a rigid shaft, and more than one that rings
-at the same frequency by itself. The coherence of a line says nothing there: a peak narrower than seven lines is no
-polynomial, and what is left of it is no noise.
+at the same frequency by itself. Where neither is the shaft, a rigid one with a torque ripple over its angle is tried.
+The coherence of a line says nothing there: a peak narrower than seven lines is no polynomial, and what is left of it is
+no noise.
 """
 
 from __future__ import annotations
@@ -52,6 +53,9 @@ few lines (measured: 493.9 +- 0.66 of 494 Hz, 130 +- 5.5 of 137 Hz), and a contr
 APART, APART_STDS = 0.02, 4.0
 """Least distance of resonance and antiresonance: closer, a second mass would be a twenty-fifth of the first; and in
 their standard deviations (12.8 and 12.4 Hz of a rigid shaft with cogging were 2.5 apart, and claimed)."""
+RIPPLE_ORDERS, RIPPLE_MOST = 128, 4
+"""Largest order of the shaft's angle at which a torque ripple is looked for (cogging: LCM of slots and poles), and most
+orders taken."""
 START_STEP = 0.02
 """Relative step of the resonances tried as a start."""
 START_ZETAS = (0.003, 0.01, 0.05, 0.2)
@@ -185,47 +189,96 @@ def estimate_frequency_response(
     omega, U, Y, T = transforms(runs, torques, direction)
     U = without_noise(U, (len(runs[0]) - 2) * noise_nm**2)
     omega, Y = omega[: U.shape[1]], Y[:, : U.shape[1]]
-    G, sigma, std, coherence = local_polynomials(U, Y)
-    inner = slice(HALF_WIDTH, len(omega) - HALF_WIDTH)
-    omega, U, Y = omega[inner], U[:, inner], Y[:, inner]
-    frequency = omega / (2.0 * math.pi)
-    coherent = coherence >= COHERENT
-    count = int(np.sum(coherent))
-    if count < COHERENT_LEAST:
-        raise refuse(
-            "E_COHERENCE",
-            f"{count} of {len(omega)} lines have a coherence of {COHERENT:g}, {COHERENT_LEAST} are needed",
-            stage=STAGE,
-        )
-    highest = float(frequency[coherent][-1])
-    lines = _Lines(omega, np.exp(-1j * omega * T), T, U, Y, sigma)
-    rigid = _fit(lines, _rigid, np.array([math.log(float(np.median(np.abs(G[coherent])))), 0.0]))
+    scale = (scale_std, tolerance or SensorTolerance())
+    result, lines, rigid = _judged(omega, U, Y, T, scale)
+    if result.information_gain > INFORMATION_GAIN and not result.found:
+        ripple = _ripple(lines, rigid, runs, direction, U.shape[1])
+        if ripple is not None:
+            steady, _, _ = _judged(omega, U + ripple, Y, T, scale)
+            return steady if steady.information_gain <= INFORMATION_GAIN else result
+    return result
+
+
+def _judged(
+    omega: Array, U: Complex, Y: Complex, T: float, scale: tuple[float, SensorTolerance]
+) -> tuple[FrequencyResponse, _Lines, Fit]:
+    """Return what transforms of torque and acceleration say, their inner lines, and the fit of one mass."""
+    lines, G, std, coherence, rigid = _rigid_shaft(omega, U, Y, T)
+    frequency = lines.omega / (2.0 * math.pi)
+    highest = float(frequency[coherence >= COHERENT][-1])
     chi2_rigid = rigid.cost / rigid.dof
     facts = (frequency, G, std, coherence, highest, chi2_rigid)
-    scale = (scale_std, tolerance or SensorTolerance())
     one = _inertia(rigid, chi2_rigid, (-1.0, 0.0), *scale)
     shown = _shown(lines, rigid)
-    start = _start(omega, G, std)
+    start = _start(lines.omega, G, std)
     if start is None:
         reason = f"rigid up to {highest:.3g} Hz: no pair of poles fits; {shown}"
-        return FrequencyResponse(*facts, math.nan, 0.0, reason=reason, inertia=one)
+        return FrequencyResponse(*facts, math.nan, 0.0, reason=reason, inertia=one), lines, rigid
     two = _fit(lines, _two_mass, start)
     chi2 = two.cost / two.dof
     # the same transients, rung by something else than the torque
     ringing = _fit(lines, lambda at, x: (_rigid(at, x)[0], _two_mass(at, two.x)[1]), rigid.x)
     terms = len(start) - len(rigid.x)
     penalty = math.log(len(rigid.residual))
-    without = min(rigid.cost - 2 * len(runs) * penalty, ringing.cost)
+    without = min(rigid.cost - 2 * len(U) * penalty, ringing.cost)
     gain = (without - two.cost) / max(1.0, chi2) - terms * penalty
     estimates = _estimates(two, chi2)
     against = _against(two, chi2, gain, estimates, frequency)
     if against:
         reason = f"no resonance found up to {highest:.3g} Hz: {against}"
-        return FrequencyResponse(*facts, chi2, gain, reason=f"{reason}; {shown}", inertia=one)
+        return FrequencyResponse(*facts, chi2, gain, reason=f"{reason}; {shown}", inertia=one), lines, rigid
     resonance, antiresonance = estimates["resonance_hz"].value, estimates["antiresonance_hz"].value
     reason = f"two masses, J_load/J_motor {(resonance / antiresonance) ** 2 - 1.0:.3g}, over {highest:.3g} Hz"
     both = _inertia(two, chi2, (-1.0, 0.0, 2.0, 0.0, -2.0, 0.0), *scale)
-    return FrequencyResponse(*facts, chi2, gain, estimates, reason, both)
+    return FrequencyResponse(*facts, chi2, gain, estimates, reason, both), lines, rigid
+
+
+def _rigid_shaft(omega: Array, U: Complex, Y: Complex, T: float) -> tuple[_Lines, Complex, Array, Array, Fit]:
+    """Return the inner lines, response, its deviation and coherence there, and the fit of one mass."""
+    G, sigma, std, coherence = local_polynomials(U, Y)
+    inner = slice(HALF_WIDTH, len(omega) - HALF_WIDTH)
+    lines = _Lines(omega[inner], np.exp(-1j * omega[inner] * T), T, U[:, inner], Y[:, inner], sigma)
+    coherent = coherence >= COHERENT
+    if (count := int(np.sum(coherent))) < COHERENT_LEAST:
+        raise refuse(
+            "E_COHERENCE",
+            f"{count} of {len(lines.omega)} lines have a coherence of {COHERENT:g}, {COHERENT_LEAST} are needed",
+            stage=STAGE,
+        )
+    start = np.array([math.log(float(np.median(np.abs(G[coherent])))), 0.0])
+    return lines, G, std, coherence, _fit(lines, _rigid, start)
+
+
+def _ripple(lines: _Lines, rigid: Fit, runs: Sequence[Trace], direction: int, count: int) -> Complex | None:
+    """Return the transforms of a torque over the angle of the shaft that one mass leaves unexplained; None without.
+
+    Its orders are taken one after the other, while each gains what the information criterion asks of a second mass.
+    """
+    G, basis = _rigid(lines, rigid.x)
+    Q, _ = np.linalg.qr(_stacked(basis.T, lines.sigma).T)
+
+    def whitened(values: Complex) -> Array:
+        rest = _stacked(values, lines.sigma)
+        return np.asarray((rest - (rest @ Q) @ Q.T).ravel())
+
+    waves, pairs = [], []
+    for order in range(1, RIPPLE_ORDERS + 1):
+        torques = [[wave(order * direction * run["theta_M_rad"]) for run in runs] for wave in (np.cos, np.sin)]
+        waves.append([transforms(runs, both, direction)[1][:, :count] for both in torques])
+        pairs.append(np.stack([whitened(G * wave[:, HALF_WIDTH : count - HALF_WIDTH]) for wave in waves[-1]], axis=1))
+    asked = max(1.0, rigid.cost / rigid.dof) * (2.0 * math.log(len(rigid.residual)) + INFORMATION_GAIN)
+    target, taken = whitened(lines.Y - G * lines.U), np.zeros((len(rigid.residual), 0))
+    ripple: Complex | None = None
+    for _ in range(RIPPLE_MOST):
+        bases = [np.linalg.qr(pair - taken @ (taken.T @ pair))[0] for pair in pairs]
+        gains = [float(np.sum((basis.T @ target) ** 2)) for basis in bases]
+        best = int(np.argmax(gains))
+        if gains[best] < asked:
+            break
+        (c, s), *_ = np.linalg.lstsq(pairs[best], target, rcond=None)
+        ripple = (0.0 if ripple is None else ripple) + c * waves[best][0] + s * waves[best][1]
+        target, taken = target - pairs[best] @ np.array([c, s]), np.concatenate([taken, bases[best]], axis=1)
+    return ripple
 
 
 def _stopped(run: Trace) -> bool:

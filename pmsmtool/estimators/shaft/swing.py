@@ -55,8 +55,7 @@ def swing_of(pushes: Sequence[Trace], torque: Torque, resonance_hz: float = 0.0,
     best = int(np.argmax(shares))
     near = np.linspace(resonance_hz - doubt_hz, resonance_hz + doubt_hz, 5) if resonance_hz > 0.0 else ()
     claimed = max((explained(float(hz)) for hz in near), default=0.0)
-    clear = shares[best] >= CLEAR and claimed < CLEAR * shares[best]
-    return float(frequencies[best]) if clear else 0.0
+    return float(frequencies[best]) if shares[best] >= CLEAR and claimed < CLEAR * shares[best] else 0.0
 
 
 def _explained(pushes: Sequence[Trace], torque: Torque) -> Callable[[float], float]:
@@ -67,7 +66,7 @@ def _explained(pushes: Sequence[Trace], torque: Torque) -> Callable[[float], flo
         moved = np.cumsum(np.cumsum(torque(push["i_d_a"], push["i_q_a"])))
         x = t / t[-1]
         Q, _ = np.linalg.qr(np.stack([np.ones_like(x), x, x * x, moved / np.max(np.abs(moved))], axis=1))
-        parts.append((t, Q, _without(Q, push["theta_M_rad"])))
+        parts.append((t, Q, push["theta_M_rad"] - Q @ (Q.T @ push["theta_M_rad"])))
     left = sum(float(rest @ rest) for _, _, rest in parts)
 
     def explained(hz: float) -> float:
@@ -76,12 +75,8 @@ def _explained(pushes: Sequence[Trace], torque: Torque) -> Callable[[float], flo
     return explained
 
 
-def _without(Q: Array, values: Array) -> Array:
-    return np.asarray(values - Q @ (Q.T @ values))
-
-
 def _power(t: Array, Q: Array, rest: Array, omega: float, zeta: float) -> float:
     """Square sum of a rest that a damped swing explains."""
     swing = np.exp(-zeta * omega * t)[:, None] * np.stack([np.cos(omega * t), np.sin(omega * t)], axis=1)
-    P, _ = np.linalg.qr(_without(Q, swing))
+    P, _ = np.linalg.qr(swing - Q @ (Q.T @ swing))
     return float(np.sum((P.T @ rest) ** 2))
