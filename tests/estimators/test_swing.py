@@ -46,3 +46,34 @@ def test_a_resonance_that_explains_the_pushes_stands_and_a_rigid_shaft_swings_at
     assert swing_of(pushes(150.0, 3.0), torque, 140.0, 1.0) == 0.0, "an elastic shaft whose resonance is a little off"
     assert swing_of(pushes(150.0, 0.0), torque) == 0.0
     assert swing_of(pushes(150.0, 3.0), torque, 400.0, 3.0) == 0.0, "nothing above it that the rows show"
+
+
+def added(first: list[Trace], second: list[Trace], share: float) -> list[Trace]:
+    """Pushes whose positions are the first's, and a share of what the second's swing adds to a rigid shaft."""
+    rigid = pushes(150.0, 0.0)
+    moved = [
+        a["theta_M_rad"] + share * (b["theta_M_rad"] - r["theta_M_rad"])
+        for a, b, r in zip(first, second, rigid, strict=True)
+    ]
+    return [
+        Trace(a.t_s, {**a.signals, "theta_M_rad": theta}, dict.fromkeys(a.signals, "1"))
+        for a, theta in zip(first, moved, strict=True)
+    ]
+
+
+def test_a_swing_that_is_not_clear_says_nothing() -> None:
+    assert swing_of(pushes(150.0, 3.0), torque, 100.0, 1.0) == 0.0, "less than twice as fast"
+    noise = np.random.default_rng(2)
+    loud = [
+        Trace(p.t_s, {**p.signals, "theta_M_rad": p["theta_M_rad"] + 0.01 * noise.standard_normal(ROWS)},
+              dict.fromkeys(p.signals, "1"))
+        for p in pushes(150.0, 0.0)
+    ]  # fmt: skip
+    assert swing_of(loud, torque) == 0.0, "no frequency explains half of it"
+
+
+def test_a_resonance_stands_where_it_explains_half_as_much_as_a_faster_swing() -> None:
+    both = added(pushes(150.0, 3.0), pushes(70.0, 3.0), 0.15)  # they explain 0.57 and 0.40
+    assert swing_of(both, torque) == pytest.approx(150.0, rel=FREQUENCY_LIMIT)
+    assert swing_of(both, torque, 70.0, 1.0) == 0.0
+    assert swing_of(pushes(150.0, 3.0), torque, 70.0, 1.0) == pytest.approx(150.0, rel=FREQUENCY_LIMIT)
