@@ -228,10 +228,11 @@ def _motor(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
 def _inverter(source: MachineFile) -> dict[str, DesignValue]:
     inverter = source.inverter
     V_dead, i_knee, how = dead_time_compensation(inverter)
-    on = V_dead > 0.0
+    on, usual = V_dead > 0.0, inverter.overmodulates or not inverter.min_off_time_s
+    utilisation = GIVEN if usual else "machine file, at most the linear range that min_off_time_s leaves"
     return {
         "inverter.T_s_ns": DesignValue(round(1e9 * inverter.T_s), GIVEN),
-        "inverter.voltage_utilisation": DesignValue(inverter.voltage_utilisation, GIVEN),
+        "inverter.voltage_utilisation": DesignValue(inverter.voltage_utilisation, utilisation),
         "inverter.dead_time_ns": DesignValue(round(1e9 * inverter.dead_time_s), GIVEN),
         "inverter.delay_periods": DesignValue(inverter.delay_periods, GIVEN),
         "inverter.deadtime_compensation": DesignValue(float(on), how),
@@ -259,7 +260,7 @@ def _protection(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
     }
 
 
-def sag_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict[str, float]:
+def voltage_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict[str, float]:
     """Return the torque share that a sagged link leaves at base and largest speed, and overmodulation's current."""
     plane, facts = at_temperature(source.machine, source.flux_map), {}
     for where, rpm in (("base_speed", rated.base_speed_rpm), ("n_max", rated.n_max_rpm)):

@@ -32,7 +32,7 @@ from pmsmtool.design.loops.speed_loop import (
     symmetric_optimum,
     symmetric_ratio,
 )
-from pmsmtool.design.ratings import Ratings, rating_values, ratings, sag_facts
+from pmsmtool.design.ratings import Ratings, rating_values, ratings, voltage_facts
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
@@ -98,7 +98,9 @@ def tune(source: MachineFile | str | Path, request: TuneRequest | None = None) -
         _design_current(choice),
         _design_speed(source, request, rated, choice, weakening.ramp_limit_rpm_per_s),
         _Part(dict(governor.values), {}, dict(governor.facts), governor.notes),
-        _Part(dict(weakening.values), {}, {**generation, **sag_facts(source, rated, V_limit), **weakening.facts}, told),
+        _Part(
+            dict(weakening.values), {}, {**generation, **voltage_facts(source, rated, V_limit), **weakening.facts}, told
+        ),
     ]
     tables: dict[str, tuple[float, ...]] = {}
     if weakening.values["field_weakening.mode"].value == FIELD_WEAKENING["lookup"]:

@@ -118,8 +118,6 @@ ROUNDED = 1e-5
 """Share by which a utilisation may be beyond the linear one by rounding."""
 SIX_STEPS_MIDDLE, SIX_STEPS_HALF_EDGE = 3.0 / math.pi, (math.sqrt(3.0) - 1.5) / math.pi
 """Fundamental of six steps over the linear limit: of the middles of the hexagon's edges, and of half an edge."""
-
-
 SIX_STEPS_HARMONIC = math.pi**2 / 9.0 - 1.0
 """Farthest that the flux of six steps, a hexagon, is from its fundamental, over that: at the corners."""
 

@@ -211,10 +211,29 @@ def test_a_file_must_state_what_overmodulation_has_to_leave() -> None:
     assert "0, 1 and 3" in two.value.violations[0]
 
 
+@pytest.mark.parametrize("shunts", [0, 1, 3])
+def test_the_file_is_held_to_the_largest_fundamental_that_the_core_knows(shunts: int) -> None:
+    values = tuned(
+        inverter__T_s_ns=T_S_NS,
+        inverter__min_off_time_ns=1500,
+        inverter__sample_window_ns=3000,
+        inverter__shunts=shunts,
+    )
+    loop = Loop(core(double=True), values, omega=0.0)
+    loop.step(mode=MODE_CURRENT)
+    inverter = replace(
+        machine().inverter, f_s_hz=1e9 / T_S_NS, min_off_time_s=1.5e-6, sample_window_s=3e-6, shunts=shunts
+    )
+    most = inverter.largest_utilisation / inverter.linear_utilisation
+    assert most == pytest.approx(loop.state.derived.over_most, rel=1e-6)
+
+
 def test_without_it_a_minimum_time_lowers_the_linear_limit() -> None:
     inverter = machine(min_off_time_s=2e-6).inverter
     assert inverter.voltage_utilisation == pytest.approx((1.0 - 2e-6 * inverter.f_s_hz) / math.sqrt(3.0))
     assert not inverter.overmodulates
+    told = tune(machine(min_off_time_s=2e-6)).values["inverter.voltage_utilisation"].method
+    assert "min_off_time_s" in told, "and the design says so"
     fast = TEXT.replace("f_s_hz = 12000.0", "f_s_hz = 30000.0")
     with pytest.raises(ConfigError, match="machine") as long:
         parse_machine(fast.replace("[inverter]\n", "[inverter]\nmin_off_time_s = 2e-5\n"))
