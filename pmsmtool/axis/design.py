@@ -448,7 +448,8 @@ def axis_values(
             rpm_from_rad_s(profile.jerk), "a ramp of one period of the load's own swing, or of 4 J / K_p"
         ),
     }
-    values = {name: value for name, value in found.items() if name in drive.offers or name in (*SPEED, *NOTCH)}
+    told = (*SPEED, *NOTCH, *(() if drive.pid else CASCADE))  # without an object, too: a person enters them
+    values = {name: value for name, value in found.items() if name in drive.offers or name in told}
     if drive.amperes:
         K_t = MIDDLE_KIND * torque_per_ampere(machine.pole_pairs, machine.psi_f_wb)
         how = "1.5 p psi_f per ampere, between peak and rms: compared, never written"

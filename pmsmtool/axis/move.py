@@ -19,6 +19,8 @@ WINDOW = 0.01
 RESTING = 1e-4
 """Largest change of the demand between samples at which it rests, of the way."""
 LEAST_SAMPLES = 50
+INSIDE = 20
+"""Last samples of a rest that are inside where an error has settled."""
 SAME_WAY = 0.01
 """Ways of two moves that are the same (relative)."""
 SAME_SPEED = 0.1
@@ -36,7 +38,8 @@ class MoveResult:
     error_peak_rad, error_rms_rad : float
         Largest following error, and its root mean square while the demand moves (rad).
     settling_s : float
-        Longest time from the end of a demand until the error stays inside 1 % of the way (s).
+        Longest time from the end of a demand until the error stays inside 1 % of the way (s); infinity where it does
+        not within the record.
     error_end_rad : float
         Largest error left at the end of the record or of a rest (rad).
     current_peak_a, current_rms_a : float
@@ -66,6 +69,8 @@ UNITS = {
 
 def shown(value: float, unit: str) -> str:
     """Return a number of a move as people read it."""
+    if math.isinf(value):
+        return "not within the record"
     factor, told = {"rad": (math.degrees(1.0), "deg"), "s": (1e3, "ms"), "1": (1.0, "")}.get(unit, (1.0, unit))
     return f"{factor * value:.4g} {told}".strip()
 
@@ -114,12 +119,14 @@ def move_result(trace: Trace) -> MoveResult:
 
 def _settled(t: Array, error: Array, window: float) -> float:
     outside = np.flatnonzero(np.abs(error) > window)
+    if outside.size and outside[-1] + INSIDE > error.size:
+        return math.inf
     return float(t[outside[-1]] - t[0]) if outside.size else 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class MoveDifference:
-    """One number of two moves; ``ratio`` is second over first, NaN where the first is 0."""
+    """One number of two moves; ``ratio`` is second over first, NaN where the first is 0 or both have no end."""
 
     name: str
     unit: str
@@ -130,6 +137,11 @@ class MoveDifference:
     def ratio(self) -> float:
         """Second over first."""
         return self.second / self.first if self.first else float("nan")
+
+    @property
+    def shown_ratio(self) -> str:
+        """The ratio as people read it."""
+        return f"{self.ratio:.3g}" if math.isfinite(self.ratio) else "-"
 
 
 Rows = Iterable[Mapping[str, Any]]
@@ -152,11 +164,11 @@ def compared_moves(first: MoveResult, second: MoveResult, kept: Sequence[Rows] =
 
 def same_move(first: Trace, second: Trace) -> bool:
     """Whether two records are of moves by one way at one speed, however often they went."""
-    (way, speed), (other_way, other_speed) = (_demanded(trace) for trace in (first, second))
+    (way, speed), (other_way, other_speed) = (demanded(trace) for trace in (first, second))
     return abs(other_way - way) <= SAME_WAY * way and abs(other_speed - speed) <= SAME_SPEED * speed
 
 
-def _demanded(trace: Trace) -> tuple[float, float]:
+def demanded(trace: Trace) -> tuple[float, float]:
     """Return the way (rad) and the mean speed (rad/s) of the demand while it moves."""
     found = move_result(trace)
     return found.way_rad, float(np.abs(np.diff(trace["theta_ref_rad"])).sum()) / found.moving_s

@@ -87,25 +87,24 @@ def _moved(first: Path, second: Path) -> bool:
 
 
 def _diff_of_moves(first: Path, second: Path, check: bool, out: Output) -> None:
-    from pmsmtool.axis.move import SAME_WAY, compared_moves, move_result, shown
+    from pmsmtool.axis.move import compared_moves, demanded, move_result, same_move, shown
     from pmsmtool.cli.move import TRACE
     from pmsmtool.errors import CheckFailed, ConfigError
     from pmsmtool.run_directory import RunDirectory
     from pmsmtool.trace_file import read_trace
 
-    before, after = (move_result(read_trace(path / TRACE)) for path in (first, second))
-    if abs(after.way_rad - before.way_rad) > SAME_WAY * before.way_rad:
+    traces = [read_trace(path / TRACE) for path in (first, second)]
+    if not same_move(*traces):
+        moves = " and ".join(f"{shown(way, 'rad')} at {speed:.3g} rad/s" for way, speed in map(demanded, traces))
         raise ConfigError(
-            f"the moves are of {shown(before.way_rad, 'rad')} and {shown(after.way_rad, 'rad')}", where=str(second),
+            f"two moves that differ: {moves} on average", where=str(second),
             hint="compare the same move: the same --by, --speed and --acceleration",
         )  # fmt: skip
+    before, after = map(move_result, traces)
     stages = [RunDirectory(path).read().stage(MOVE) for path in (first, second)]
     rows = compared_moves(before, after, [() if stage is None else stage.values for stage in stages])
-    cells = [
-        (row.name, shown(row.first, row.unit), shown(row.second, row.unit), f"{row.ratio:.3g}" if row.first else "-")
-        for row in rows
-    ]
-    data = [{**_facts(row), "ratio": row.ratio if row.first else None} for row in rows]
+    cells = [(row.name, shown(row.first, row.unit), shown(row.second, row.unit), row.shown_ratio) for row in rows]
+    data = [{**_facts(row), "ratio": row.ratio} for row in rows]
     out.result("diff", {"moves": data}, table(("move", "first", "second", "second / first"), cells))
     worse = [row.name for row in rows if row.name in ("error_peak_rad", "error_rms_rad") and row.ratio > WORSE]
     if check and worse:

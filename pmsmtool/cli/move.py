@@ -81,7 +81,7 @@ def move_command(
     With --identify: inertia and Coulomb friction of MACHINE from the current of the moves, for a drive without a torque
     mode. They rest on the flux linkage and the pole pairs of MACHINE. Exit code 6 when the moves do not identify them.
     """
-    from pmsmtool.axis.move import UNITS, move_result
+    from pmsmtool.axis.move import UNITS, move_result, shown
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.drive.envelope import Envelope
     from pmsmtool.drive.guard import guarded
@@ -145,7 +145,7 @@ def move_command(
     run.add(
         Stage(
             "move", "pass", seconds, values=values, files={TRACE: ""},
-            summary=f"following error at most {peak:.4g} deg, settled in {1e3 * found.settling_s:.3g} ms",
+            summary=f"following error at most {peak:.4g} deg, settling: {shown(found.settling_s, 's')}",
         )
     )  # fmt: skip
     told = {} if source is None else _identified(source, trace, drive, run, path, out)

@@ -235,7 +235,7 @@ def _axis(
     if lacking:
         raise Partial(
             f"the drive has no object of known unit for {', '.join(lacking)}",
-            hint="`pmsmtool map learn` finds out what a gain of the speed loop counts",
+            hint="enter them with the maker's software; `pmsmtool map learn` measures what one of a speed gain counts",
         )
 
 

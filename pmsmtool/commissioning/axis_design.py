@@ -90,6 +90,7 @@ def not_offered(drive_map: DriveMap) -> dict[str, str]:
 def axis_parameters(design: Design) -> ParameterSet:
     """Return what of a design is written for its axis."""
     whole = design.parameter_set()
-    kept = {name: value for name, value in whole.values.items() if name in AXIS_ROWS}
+    other = CASCADE[:2] if design.facts["axis_structure"] == "pid" else ()
+    kept = {name: value for name, value in whole.values.items() if name in AXIS_ROWS and name not in other}
     said = {name: text for name, text in whole.provenance.items() if name in kept or name == "machine"}
     return replace(whole, values=kept, tables={}, provenance=said)

@@ -328,7 +328,7 @@ def _move_table(moves: Mapping[str, tuple[Trace, Stage]]) -> Table | None:
     cells = [
         (
             row.name, *((shown(row.first, row.unit),) if both else ()), shown(row.second, row.unit),
-            *((f"{row.ratio:.3g}" if row.first else "-",) if both else ()),
+            *((row.shown_ratio,) if both else ()),
         )
         for row in rows
     ]  # fmt: skip

@@ -52,7 +52,7 @@ _NEXT_STEP = {
     "current": "raise the limit knowingly (--i-max), or ask for less",
     "d current": "state i_d_min_apk in the machine file where the magnets stand more, or ask for less",
     "speed": "raise the limit knowingly (--speed-max), or ask for less",
-    "travel": "clamp the shaft, or give --shaft free where it may turn",
+    "travel": "clamp the shaft, or allow more travel; a move by the drive's own position loop: ask for a slower one",
 }
 OVERSHOOT = 1.25
 """Measured current or speed over its limit that ends an experiment: regulation overshoots, noise peaks."""

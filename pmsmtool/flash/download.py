@@ -225,9 +225,15 @@ class Download:
         ConfigError, SafetyRefusal
             As ``flash.map_gate.check_map`` and :func:`refuse_while_enabled`.
         NotAvailable
-            It is to be stored, and the drive has no command for it.
+            The plan has no entry; or it is to be stored, and the drive has no command for it.
         """
         check_map(self.node.map, self.identity, self.folder)
+        if not self.plan.entries:  # storing would keep what others left in it, for nothing
+            raise NotAvailable(
+                f"the map {self.node.map.name!r} has no object for any value of the set",
+                where=f"node {self.node.node}",
+                hint="enter the values with the maker's software, or write the rows of your manual into a map",
+            )
         if store and not self.node.can_store():
             raise NotAvailable(
                 NO_STORE, where=f"node {self.node.node}",

@@ -185,3 +185,14 @@ def test_a_gain_per_increment_follows_the_increments_that_the_drive_holds() -> N
     with pytest.raises(ConfigError, match="no increments of a turn"):
         make_plan(drive_map, wanted, found)
     assert "increments" in drive_map.not_written(["position.K_p_per_s"])["position.K_p_per_s"]
+
+
+def test_gains_without_an_object_are_those_of_the_axis() -> None:
+    """A person enters them by hand; the position gain of the design for a rigid shaft was there (45.9 for 20.6 1/s)."""
+    made = designed("copley", 0.0, 0.0)
+    rows = axis_parameters(made)
+    assert rows.values["position.K_p_per_s"] == made.facts["axis_K_v_per_s"]
+    share, J = float(made.facts["axis_inertia_ff_share"]), made.machine.machine.J_kgm2 or 0.0
+    assert rows.values["position.inertia_ff_kgm2"] == pytest.approx(share * J, rel=1e-12)
+    assert "stiffest" in rows.provenance["position.K_p_per_s"]
+    assert "position.K_p_per_s" not in axis_parameters(designed("epos4", 0.0, 0.0)).values  # one PID of the position

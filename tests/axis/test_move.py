@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pmsmtool.axis.move import compared_moves, move_result, same_move
+from pmsmtool.axis.move import compared_moves, move_result, same_move, shown
 from pmsmtool.axis.reference import Profile, plan
 from pmsmtool.errors import IdentificationError
 from pmsmtool.trace import Trace
@@ -41,6 +41,17 @@ def test_settling_is_the_last_time_outside_one_percent_of_the_way() -> None:
     """At the end of a braking ramp the late shaft is 60 t^2 rad short: outside 15 mrad until 16 ms before it rests."""
     found = move_result(record(40e-3))
     assert found.settling_s == pytest.approx(40e-3 - np.sqrt(0.015 / 60.0), abs=3e-3)
+
+
+def test_an_error_that_stays_outside_has_not_settled() -> None:
+    """A tenth of a radian is left of 1.5: more than 1 %."""
+    trace = record(5e-3)
+    left = np.where(trace.t_s > 0.5, 0.1, 0.0)
+    stuck = {**trace.signals, "theta_m_rad": trace["theta_m_rad"] - left}
+    found = move_result(Trace(trace.t_s, stuck, trace.units, trace.meta))
+    assert found.settling_s == np.inf and found.error_end_rad == pytest.approx(0.1, rel=1e-3)
+    rows = {row.name: row for row in compared_moves(found, found)}
+    assert rows["settling_s"].shown_ratio == "-" and shown(found.settling_s, "s") == "not within the record"
 
 
 def test_the_same_move_has_the_same_way_and_speed() -> None:

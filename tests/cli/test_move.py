@@ -51,6 +51,10 @@ def test_the_same_move_with_stored_and_with_new_gains(tool: Tool, drive: Sequenc
     rows = {row["name"]: row for row in json.loads(printed)["moves"]}
     assert code == 0 and rows["error_peak_rad"]["ratio"] < MOST
     assert tool("diff", after["run"], before["run"], "--check")[0] == 1  # the other way round it got worse
+    code, printed, said = tool("move", "--by", "60deg", "--speed", "100rpm", *ASKED[4:], *drive)
+    assert code == 0, said
+    code, _, said = tool("diff", before["run"], json.loads(printed)["run"])  # a slower move follows better, always
+    assert code == 2 and "two moves that differ" in said
     assert tool("report", after["run"])[0] == 0
     page = (Path(after["run"]) / "report.html").read_text(encoding="utf-8")
     assert "now / before" in page and Path(before["run"]).name in page

@@ -44,6 +44,14 @@ def test_a_drive_without_units_gets_a_table_and_exit_code_10(tool: Tool) -> None
     assert "0x2331:01 or 0x60F9:01" in said and "map learn" in said
 
 
+def test_a_set_without_any_object_is_not_stored(tool: Tool) -> None:
+    """Storing keeps what others left in the drive, and a reset loses its homing: both for nothing."""
+    drive = ("--map", "nanotec", "--sim", "interior-2k2?drive=nanotec&nv=axis.nv", "--yes")
+    assert tool("tune", "interior-2k2", "-o", "axis.toml", "--axis", "--map", "nanotec")[0] == 10
+    code, _, said = tool("flash-params", "axis.toml", *drive)
+    assert code == 9 and "no object for any value of the set" in said and "storing" not in said
+
+
 def test_a_rate_without_the_axis_is_refused(tool: Tool) -> None:
     code, _, said = tool("tune", "interior-2k2", "-o", "design.toml", "--loop-rate-hz", "1000")
     assert code == 2 and "--axis" in said
