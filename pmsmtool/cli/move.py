@@ -103,8 +103,8 @@ def move_command(
     with bus.connect() as connection:
         drive = PositionDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
         check_motion(drive.node.map, drive.identity)
-        lent = _lent(drive, profile)
-        speed = lent.get(_SPEED) or _held(drive, _SPEED)
+        lent, find = _lent(drive, profile)
+        speed = profile.get(_SPEED) or _held(drive, _SPEED)
         speed_max = motion.speed_max_rad_s or (SPEED_MARGIN * rad_s_from_rpm(speed) if speed else None)
         if speed_max is None:
             raise ConfigError(
@@ -124,6 +124,7 @@ def move_command(
             f"the shaft moves by {math.degrees(way_rad):.4g} deg and back with the drive's own position loop, {times} "
             f"time{'s' if times > 1 else ''}",
             f"voltage off where the shaft is {math.degrees(drive.error_limit_rad):.3g} deg behind and comes no nearer",
+            *([] if find is None else ["its profile is found first by slower moves within this way"]),
             *(f"lent: {name} {value:.5g} {_unit(name)}" for name, value in lent.items()),
             "nothing is stored in the drive; every changed object is restored",
         ]  # fmt: skip
@@ -132,11 +133,11 @@ def move_command(
         with guarded(drive, envelope, say=out.note) as guard:
             guard.write(lent)
             began = connection.clock.now()
-            trace = record_move(guard, drive, way_rad, settle_s, times)
+            trace, counts = record_move(guard, drive, way_rad, settle_s, times, find)
             seconds = connection.clock.now() - began
         drive.close()
-    if drive.ramp_lent != 1.0:
-        out.warn(f"the drive's own ramp (0x6083) is slow: {drive.ramp_lent:.3g} times it was lent for this move")
+    if counts is not None:
+        out.note(f"lent: {counts}")
     run.save(TRACE, trace_npz(trace))
     found = move_result(trace)
     values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]
@@ -149,7 +150,7 @@ def move_command(
         )
     )  # fmt: skip
     told = {} if source is None else _identified(source, trace, drive, run, path, out)
-    data = {"run": run.path, "move": asdict(found), "gains": gains, "lent": lent, "identified": told}
+    data = {"run": run.path, "move": asdict(found), "gains": gains, "lent": lent, "profile": counts, "identified": told}
     out.result("move", data, lambda: [*_lines(found), *_told(told)])
     out.note(f"run: {run.path}")
 
@@ -228,18 +229,18 @@ def _profile(design: Path | None, speed_rad_s: float | None, acceleration: float
     }  # fmt: skip
 
 
-def _lent(drive: PositionDrive, profile: dict[str, float]) -> dict[str, float]:
-    """Return what of a profile this drive can be lent; refuses what was asked for and has no row."""
-    from pmsmtool.errors import NotAvailable
+def _lent(drive: PositionDrive, profile: dict[str, float]) -> tuple[dict[str, float], tuple[float, float] | None]:
+    """Return what of a profile this drive can be lent by its map, and what is to be found by its demand (rad/s)."""
+    from pmsmtool.errors import ConfigError
+    from pmsmtool.units import rad_s_from_rpm
 
     cells = drive.node.map.cells
-    lacking = [name for name in profile if name not in cells and name != _JERK]
-    if lacking:
-        raise NotAvailable(
-            f"the map {drive.node.map.name!r} has no row for {', '.join(lacking)}", where=f"node {drive.node.node}",
-            hint="leave --design, --speed and --acceleration out: the drive then moves as it is set up",
-        )  # fmt: skip
-    return {name: value for name, value in profile.items() if name in cells}
+    if not profile or all(name in cells for name in profile if name != _JERK):
+        return {name: value for name, value in profile.items() if name in cells}, None
+    if not {_SPEED, _UP} <= set(profile):
+        lacks = f"the map {drive.node.map.name!r} lacks units of the profile"
+        raise ConfigError(lacks, hint="give both --speed and --acceleration")
+    return {}, (rad_s_from_rpm(profile[_SPEED]), rad_s_from_rpm(profile[_UP]))
 
 
 def _held(drive: PositionDrive, name: str) -> float | None:

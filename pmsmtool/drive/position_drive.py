@@ -7,12 +7,12 @@ any delay of the bus. The position loop is the drive's own: every stop removes t
 
 from __future__ import annotations
 
-import contextlib
 import math
 from contextlib import AbstractContextManager
 
 import numpy as np
 
+from pmsmtool.arrays import Array
 from pmsmtool.axis.design import AXIS_GAINS
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
@@ -47,8 +47,6 @@ class PositionDrive(TorqueDrive):
         times that, in any case.
     current_allowed_apk : float
         Rated current, or the drive's own limit where that is smaller (A peak).
-    ramp_lent : float
-        Factor by which the drive's ramps are faster than stored.
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
 
@@ -76,7 +74,6 @@ class PositionDrive(TorqueDrive):
                 hint="`pmsmtool caps` lists what this drive can measure",
             )  # fmt: skip
         self.error_limit_rad = math.inf
-        self.ramp_lent = 1.0
         kept = allowed(self.node, current_limits(self.node, self._rated_apk))
         self.current_allowed_apk = self._rated_apk if kept is None else min(self._rated_apk, kept[1])
         self.sends = True
@@ -98,8 +95,8 @@ class PositionDrive(TorqueDrive):
         self.node.put(TARGET_POSITION, self._start_counts)
         self._energise(Mode.PROFILE_POSITION)
 
-    def move_to(self, angle_rad: float) -> None:
-        """Start a move to an angle from where the shaft stood when it was enabled.
+    def move_to(self, angle_rad: float, *, at_once: bool = False) -> None:
+        """Start a move to an angle from where the shaft stood when it was enabled; ``at_once`` ends another move.
 
         Raises
         ------
@@ -107,20 +104,34 @@ class PositionDrive(TorqueDrive):
             The drive does not take the set-point.
         """
         counts = self._start_counts + angle_rad / (2.0 * math.pi) * self.counts_per_turn
-        start_move(self.node, counts)
+        start_move(self.node, counts, at_once=at_once)
 
     def profile(self) -> str:
         """Return what the drive's own profile holds, in its units."""
         held = ((item, self.node.held(item)) for item in (objects.PROFILE_VELOCITY, *RAMPS))
         return ", ".join(f"0x{item.index:04X} = {value:.0f}" for item, value in held if value is not None)
 
-    def lend_ramp(self, factor: float) -> None:
-        """Make the drive's ramps faster by a factor, whatever their unit; the guard brings the old ones back."""
-        self.ramp_lent = factor
-        with contextlib.suppress(SdoAbort):  # a drive that refuses goes on as slowly
-            for item in RAMPS:
-                if (counts := self.node.held(item)) is not None:
-                    self.node.put(item, min(LARGEST, round(counts * factor)))
+    def ramp_counts(self) -> float:
+        """Return what the drive's acceleration (0x6083) holds; 0 where it has none."""
+        return self.node.held(objects.PROFILE_ACCELERATION) or 0.0
+
+    def lend_profile(self, speed: int, ramp: int) -> None:
+        """Write counts of speed and of both ramps, whatever their unit; the guard brings the old ones back.
+
+        Raises
+        ------
+        NotAvailable
+            The drive refuses them.
+        """
+        for item, counts in zip((objects.PROFILE_VELOCITY, *RAMPS), (speed, ramp, ramp), strict=True):
+            try:
+                if self.node.held(item) not in (None, counts):
+                    self.node.put(item, counts)
+            except SdoAbort as abort:
+                raise NotAvailable(
+                    f"the drive refuses {counts} in 0x{item.index:04X}", where=abort.where,
+                    hint="leave --design, --speed and --acceleration out: the drive then moves as it is set up",
+                ) from abort  # fmt: skip
 
     def demanded_rad(self) -> float:
         """Return the demand as the drive shows it now, from where the shaft stood when it was enabled."""
@@ -128,6 +139,11 @@ class PositionDrive(TorqueDrive):
 
     def _angle(self, counts: float) -> float:
         return 2.0 * math.pi * (counts - round(counts / WHOLE) * WHOLE) / self.counts_per_turn
+
+    @property
+    def rad_per_count(self) -> float:
+        """Angle of one unit of the position (rad)."""
+        return 2.0 * math.pi / abs(self.counts_per_turn)
 
     # ---- records --------------------------------------------------------------------------------
 
@@ -143,6 +159,24 @@ class PositionDrive(TorqueDrive):
             return
         self._sending = sending
         live.on_set = lambda stamp_s: self._take(stamp_s, *(live.values[name] for name in SHOWN))
+
+    @property
+    def samples(self) -> int:
+        """Samples noted so far."""
+        return len(self._taken)
+
+    def demand_since(self, first: int) -> tuple[Array, Array]:
+        """Return times (s) and demands (rad) noted from a sample on, shape (n,)."""
+        table = np.array(self._taken[first:], dtype=np.float64).reshape(-1, 4)
+        return table[:, 0], table[:, 2]
+
+    def lag_rad(self) -> float:
+        """Return the following error of the latest sample (rad); 0 without one."""
+        return self._taken[-1][2] - self._taken[-1][1] if self._taken else 0.0
+
+    def forget_samples(self) -> None:
+        """Let the record begin now."""
+        self._taken = []
 
     def end_samples(self) -> Trace:
         """Bring the drive's process data back; return what was noted: angles from the start (rad), current (A)."""
@@ -164,7 +198,7 @@ class PositionDrive(TorqueDrive):
             self._take(now, *(self.node.get(item) for item in (POSITION, POSITION_DEMAND, self._current.item)))
         super().wait(max(0.0, end - clock.now()))
         if self._taken and self._recording:
-            error = self._taken[-1][2] - self._taken[-1][1]
+            error = self.lag_rad()
             if abs(error) > self.error_limit_rad and (
                 not self._follows(error) or abs(error) > WHOLE_WAY * self.error_limit_rad
             ):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from pmsmtool.cia402 import Command
+from pmsmtool.cia402 import Command, Control
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
@@ -17,8 +17,10 @@ ACKNOWLEDGE_S = 0.5
 WHOLE = 2.0**32
 
 
-def start_move(node: DriveNode, counts: float) -> None:
+def start_move(node: DriveNode, counts: float, *, at_once: bool = False) -> None:
     """Start a move to a position (increments, modulo 2^32) of a drive that is enabled in profile position mode.
+
+    Without ``at_once`` a drive that moves already goes there after its move.
 
     Raises
     ------
@@ -26,7 +28,8 @@ def start_move(node: DriveNode, counts: float) -> None:
         The drive does not take the set-point.
     """
     node.put(TARGET_POSITION, (round(counts) + WHOLE / 2) % WHOLE - WHOLE / 2)
-    node.command(objects.CONTROLWORD, Command.ENABLE_OPERATION | NEW_SET_POINT)
+    word = Command.ENABLE_OPERATION | (Control.AT_ONCE if at_once else 0)
+    node.command(objects.CONTROLWORD, word | NEW_SET_POINT)
     until = node.connection.clock.now() + ACKNOWLEDGE_S
     while not node.whole(objects.STATUSWORD) & ACKNOWLEDGED:
         if node.connection.clock.now() > until:
@@ -36,4 +39,4 @@ def start_move(node: DriveNode, counts: float) -> None:
                 likely="the drive expects homing first, or the target is beyond its software limits (0x607D)",
                 hint="home it, or widen the limits with the maker's software",
             )  # fmt: skip
-    node.command(objects.CONTROLWORD, Command.ENABLE_OPERATION)
+    node.command(objects.CONTROLWORD, word)

@@ -8,12 +8,17 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from pmsmtool.arrays import Array
+from pmsmtool.axis.demand import trapezoid_of
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.trace import Trace
+from pmsmtool.trace_file import read_trace
 from tests.cli.conftest import Tool
-from tests.foreign.data_sheets import Row, epos4, faulhaber, write_eds
+from tests.foreign.data_sheets import Row, epos4, faulhaber, unknown, write_eds
 
 POSITION: tuple[Row, ...] = (
     (0x1010, 1, "U32", "rw", "1"), (0x6062, 0, "I32", "ro", "0"), (0x607A, 0, "I32", "rw", "0"),
@@ -86,6 +91,44 @@ def test_a_calm_loop_lags_and_a_blocked_shaft_stands(tool: Tool, tmp_path: Path,
         assert code == 0 and move["error_peak_rad"] > 0.25 * math.pi and abs(move["error_end_rad"]) < 0.01, said
     else:
         assert code == 5 and "following error" in said, said
+
+
+UNITS_WITHIN = 0.05
+"""Speed and acceleration of the demand over those asked for (relative); measured 0.9 % and 4 %."""
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("ramp", ["1", "2000000000"])
+def test_a_profile_of_unknown_unit_is_found_by_the_demand(tool: Tool, tmp_path: Path, ramp: str) -> None:
+    """Stored ramps that take minutes, or none: the move is the one that is asked for, and the counts come back."""
+    profile = ((0x6081, 0, "U32", "rw", "7"), (0x6083, 0, "U32", "rw", ramp), (0x6084, 0, "U32", "rw", ramp))
+    eds = write_eds(tmp_path / "unit.eds", unknown("0x2D", *POSITION, *profile))
+    channel = ("--sim", f"interior-2k2?eds={eds}&nv={tmp_path / 'unit.nv'}")
+    asked = ("--by", "90deg", "--speed", "120rpm", "--acceleration", "120", "--yes", "--json", "--settle", "0.2s")
+    code, printed, said = tool("move", *asked, *channel, "--identify", "interior-2k2")
+    assert code == 0, said
+    answer = json.loads(printed)
+    found = answer["profile"]
+    assert found["speed_rad_s"] == pytest.approx(4.0 * math.pi, rel=UNITS_WITHIN)
+    assert found["speed_counts"] == pytest.approx(2.0 * 131072, rel=UNITS_WITHIN)  # increments per second
+    assert found["ramp_counts"] == pytest.approx(120.0 / (2.0 * math.pi) * 131072, rel=2.0 * UNITS_WITHIN)
+    trace = read_trace(Path(answer["run"]) / "traces" / "move.npz")
+    speed, ramp_s = trapezoid_of(*first_move(trace))
+    assert speed == pytest.approx(4.0 * math.pi, rel=UNITS_WITHIN)
+    assert speed / ramp_s == pytest.approx(120.0, rel=2.0 * UNITS_WITHIN)
+    inertia = answer["identified"]["J_kgm2"]
+    assert abs(inertia["value"] - J) < inertia["systematic"] + 2.0 * inertia["std"] < 0.5 * J
+    code, _, said = tool("move", "--by", "90deg", "--speed", "120rpm", "--yes", *channel)
+    assert code == 2 and "both --speed and --acceleration" in said
+    code, printed, _ = tool("-n", "1", "param", "get", "0x6083", *channel)
+    assert ramp in printed
+
+
+def first_move(trace: Trace) -> tuple[Array, Array]:
+    """Return times and demands of the way there, with some rest."""
+    demand = trace["theta_ref_rad"]
+    end = int(np.argmax(demand > 0.9999 * demand.max())) + 100
+    return trace.t_s[:end], demand[:end]
 
 
 @pytest.mark.chain

@@ -57,6 +57,9 @@ def test_a_set_point_is_taken_modulo_the_counter(counts: float, target: int) -> 
         assert table.number(TARGET_POSITION) == target
         words = [int(word) for _, word in table.written(objects.CONTROLWORD)]
         assert words == [0x1F, 0x0F], "new set-point, and ready for the next"
+        start_move(node, counts, at_once=True)
+        words = [int(word) for _, word in table.written(objects.CONTROLWORD)]
+        assert words[2:] == [0x3F, 0x2F], "bit 5: not after the move that is under way"
 
 
 @pytest.mark.parametrize(("late_s", "taken"), [(0.4, True), (0.6, False)])

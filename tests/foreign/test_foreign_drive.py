@@ -117,6 +117,31 @@ def test_torque_moves_the_machine_and_is_shown(tmp_path: Path) -> None:
         node.disable_voltage()
 
 
+@pytest.mark.parametrize("at_once", [False, True])
+def test_a_second_set_point_waits_unless_it_shall_act_at_once(tmp_path: Path, at_once: bool) -> None:
+    """CiA 402-2, profile position mode: bit 5 of the controlword."""
+    moves: tuple[Row, ...] = tuple(
+        (index, 0, kind, "rw", "") for index, kind in ((0x607A, "I32"), (0x6062, "I32"))
+    )  # fmt: skip
+    with opened(write_eds(tmp_path / "drive.eds", (*epos4(), *moves))) as node:
+        node.sdo.download(0x6060, 0, b"\1")
+        node.enable()
+        start = number(node, 0x6064, signed=True)
+        turn = round(4.0 * number(node, 0x3010, 1))
+        for target in (start + turn // 2, start):
+            node.sdo.download(0x607A, 0, target.to_bytes(4, "little", signed=True))
+            node.sdo.download(0x6040, 0, (0x3F if at_once else 0x1F).to_bytes(2, "little"))
+            node.sdo.download(0x6040, 0, (0x0F).to_bytes(2, "little"))
+            node.connection.wait(0.01)
+        highest = start
+        for _ in range(40):
+            node.connection.wait(0.01)
+            highest = max(highest, number(node, 0x6062, signed=True))
+        assert abs(number(node, 0x6062, signed=True) - start) < 0.01 * turn
+        assert (highest - start > 0.49 * turn) is not at_once
+        node.disable_voltage()
+
+
 def test_its_own_current_limit_acts(tmp_path: Path) -> None:
     with opened(write_eds(tmp_path / "drive.eds", copley())) as node:
         node.sdo.download(0x2110, 0, (60).to_bytes(2, "little"))  # 0.6 A peak

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pmsmtool.sim.node.schedule import Schedule
 
 TURN = 2.0 * math.pi
-NEW_SET_POINT, RELATIVE, HALT = 0x0010, 0x0040, 0x0100
+NEW_SET_POINT, AT_ONCE, RELATIVE, HALT = 0x0010, 0x0020, 0x0040, 0x0100
 ACKNOWLEDGED, REACHED = 0x1000, 0x0400
 DERIVATIVE_POLE = 10.0
 """Pole of the derivative over K_P / K_D (EPOS4 application notes, rel6835)."""
@@ -97,6 +97,7 @@ class PositionLoop:
     def _begin(self, turns: float) -> None:
         self.demand = self._at = self._ahead = turns
         self._move: _Trapezoid | None = None
+        self._waiting: float | None = None
         self._began_ns = 0
         self._sum = self._derivative = self._error = self._demand_speed = 0.0
 
@@ -160,12 +161,18 @@ class PositionLoop:
             self._schedule.after(self._T, self._tick)
         if rising & NEW_SET_POINT and self._mode() == 1:
             wanted = self._find(0x607A, 0).number() / self._per_turn + (self.demand if word & RELATIVE else 0.0)
-            speed = self._number(0x6081, 1.0) / self._per_rps
-            up = self._number(0x6083, 1.0) / self._per_rps
-            down = self._number(0x6084, up * self._per_rps) / self._per_rps
-            self._move = _Trapezoid(self.demand, wanted, speed, up, down)
-            self._began_ns = self._schedule.now_ns
+            if self._move is None or word & AT_ONCE:
+                self._go(wanted)
+            else:  # CiA 402-2: taken after the move that is under way
+                self._waiting = wanted
         self._acknowledged = bool(word & NEW_SET_POINT)
+
+    def _go(self, wanted: float) -> None:
+        speed = self._number(0x6081, 1.0) / self._per_rps
+        up = self._number(0x6083, 1.0) / self._per_rps
+        down = self._number(0x6084, up * self._per_rps) / self._per_rps
+        self._move, self._waiting = _Trapezoid(self.demand, wanted, speed, up, down), None
+        self._began_ns = self._schedule.now_ns
 
     def _reference(self) -> tuple[float, float, float]:
         if self._mode() == 8:
@@ -177,6 +184,8 @@ class PositionLoop:
         found = self._move.at(t)
         if self._move.over(t):
             self._move = None
+            if self._waiting is not None:
+                self._go(self._waiting)
         return found
 
     def _tick(self) -> None:

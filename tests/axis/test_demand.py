@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: MIT
+"""Speed and ramp of a demand that is known, in whole counts and samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pmsmtool.axis.demand import trapezoid_of
+from pmsmtool.axis.reference import Profile, plan
+
+SPEED_WITHIN, RAMP_WITHIN = 0.015, 0.02
+"""Relative; measured 1.0 % both."""
+
+
+@pytest.mark.parametrize("counts", [4096, 65536])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("speed", "acceleration"), [(8.0, 300.0), (8.0, 90.0), (3.0, 60.0), (20.0, 200.0)])
+def test_speed_and_ramp_of_a_trapezoid(speed: float, acceleration: float, sign: float, counts: int) -> None:
+    move = plan(sign * 1.0, Profile(speed, acceleration))
+    t = np.arange(0.0, 0.2 + move.duration_s + 0.1, 1e-3)
+    unit = 2.0 * np.pi / counts
+    demand = 0.3 + unit * np.round(move.at(t - 0.1)[0] / unit)
+    found, ramp = trapezoid_of(t, demand)
+    peak = min(speed, np.sqrt(acceleration * 1.0))
+    assert found == pytest.approx(peak, rel=SPEED_WITHIN)
+    assert ramp == pytest.approx(peak / acceleration, rel=RAMP_WITHIN)
+
+
+def test_a_step_of_the_speed_has_no_ramp() -> None:
+    t = np.arange(0.0, 0.5, 1e-3)
+    speed, ramp = trapezoid_of(t, np.clip(10.0 * (t - 0.1), 0.0, 1.0))
+    assert speed == pytest.approx(10.0, rel=SPEED_WITHIN) and ramp < 3e-3
