@@ -7,6 +7,7 @@ The page is made from the record of a run and from figures drawn elsewhere; noth
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -106,7 +107,7 @@ def render(
         changes=_changes(changes) if changes else None,
         not_checked=list(not_checked),
         signatures=(_SIGNED, [[(role, ""), *[("", "")] * (len(_SIGNED) - 1)] for role in _ROLES]),
-        conditions=(("condition", "value"), [[(key, ""), (value, "small")] for key, value in _conditions(record)]),
+        conditions=(("condition", "value"), [[(key, "limit"), (value, "small")] for key, value in _conditions(record)]),
         files=(("file", "SHA-256"), [[(text, "small") for text in row] for row in files]) if files else None,
     )
 
@@ -150,9 +151,12 @@ def _comparison(rows: Sequence[Mapping[str, Any]]) -> Table:
     """Return the table *data sheet | drive | measured*, with a drawing of the intervals where there are two."""
     heads = (*HEADS[:-1], "allowed and measured", HEADS[-1])
     body = [
-        [*((text, "") for text in cells[:-1]), (_intervals(row), ""), (cells[-1], _VERDICTS.get(cells[-1], ""))]
+        [
+            *((text, "" if column in (0, 2) else "number") for column, text in enumerate(cells[:-1])),
+            (_intervals(row), ""), (cells[-1], _VERDICTS.get(cells[-1], "")),
+        ]
         for row, cells in zip(rows, table_cells(rows), strict=True)
-    ]
+    ]  # fmt: skip
     used = [k for k in range(len(heads)) if any(row[k][0] for row in body)]
     return [heads[k] for k in used], [[row[k] for k in used] for row in body]
 
@@ -205,9 +209,9 @@ def template(name: str) -> jinja2.Template:
 
     folder = resources.files("pmsmtool.report").joinpath("templates")
     loader = jinja2.FunctionLoader(lambda part: folder.joinpath(part).read_text(encoding="utf-8"))
-    return jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
-    ).get_template(name)
+    pages = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    pages.filters["parts"] = lambda text: re.split(r" (?=\+-|\()", str(text))  # of a number that must not break within
+    return pages.get_template(name)
 
 
 _ESTIMATE = (
@@ -249,7 +253,7 @@ def total_interval(std: float, systematic: float, coverage_factor: float = 1.96)
 def _conditions(record: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [("command", " ".join(map(str, record.get("command", ()))))]
     for group in ("drive", "bus", "envelope", "versions"):
-        known = {key: value for key, value in record.get(group, {}).items() if value is not None}
+        known = {key: value for key, value in record.get(group, {}).items() if value not in (None, "")}
         rows += [(f"{group}: {key}", _readable(key, value)) for key, value in known.items()]
     rows += [("instrument", str(line)) for line in record.get("instruments", ())]
     for consent in record.get("consents", ()):

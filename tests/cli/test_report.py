@@ -178,7 +178,7 @@ def test_values_with_a_deviation_become_the_table(made: Path, tmp_path: Path) ->
     shutil.copytree(made, run.path)
     value = {"name": "R_s_ohm", "value": 0.13712, "std": 2e-4, "systematic": 1.4e-3, "unit": "ohm", "T_c": 20.0}
     run.write(replace(run.read(), stages=(Stage("identify", "pass", 9.0, values=[value]), *run.read().stages)))
-    assert "0.1371 +- 0.0015 ohm" in page_of(run.path)
+    assert "<span>0.1371</span> <span>+- 0.0015 ohm</span>" in page_of(run.path)
 
 
 @pytest.mark.parametrize(
@@ -304,28 +304,72 @@ def test_it_says_on_a_terminal_that_it_works(
     assert capsys.readouterr().err.startswith("\rwriting the report ...\r")
 
 
+def in_a_frame(folder: Path, page: str, width_mm: float, script: str) -> str:
+    """Return what a script finds in a page that is so wide; ``page`` is its document there."""
+    (folder / "report.html").write_text(page, encoding="utf-8")
+    (folder / "frame.html").write_text(
+        f'<iframe id="frame" src="report.html" style="width:{width_mm}mm;height:800px;border:0"></iframe>'
+        '<pre id="out"></pre><script>document.getElementById("frame").onload = event => {'
+        "const page = event.target.contentDocument;"
+        f'document.getElementById("out").textContent = {script}}};</script>',
+        encoding="utf-8",
+    )
+    command = [
+        str(find_browser()), *QUIET, "--no-sandbox", f"--user-data-dir={folder}/profile", "--window-size=900,900",
+        "--hide-scrollbars", "--allow-file-access-from-files", "--virtual-time-budget=20000", "--dump-dom",
+    ]  # fmt: skip
+    address = (folder / "frame.html").as_uri()
+    seen = subprocess.run([*command, address], capture_output=True, text=True, timeout=LIMIT_S, check=True).stdout
+    found = re.search(r'<pre id="out">(.*?)</pre>', seen)
+    assert found is not None, seen[-500:]
+    return found[1]
+
+
+def page_with_values(run: RunDirectory) -> str:
+    """A page with the widest values and rows seen: a small friction, a comparison with a data sheet."""
+    values = [
+        {**value_facts(name, estimate), "accepted": True}
+        for name, estimate in {
+            "R_s_ohm_measured": Estimate(3.6, 0.004, 0.06, "ohm", T_c=25.0, method="multi-level DC, asymptotic slope"),
+            "J_per_psi": Estimate(2.62e-3, 9.2e-6, 3.7e-5, "kg m2/Wb", method="regression over torque pulses"),
+            "B_nms": Estimate(2e-3, 3e-6, 2.8e-5, "N m s", method="torque pulses, output error, whitened"),
+        }.items()
+    ]
+    row = {
+        "name": "J_per_psi", "unit": "kg m2/Wb", "interval": 4.2e-5, "stated": 0.002607, "held": None,
+        "factory": False, "measured": 0.002623, "low": 0.0021, "high": 0.0031, "verdict": "agrees",
+        "tolerance": "11 % by its [std] and 11 % by its [std], magnets 5 to 90 degC",
+    }  # fmt: skip
+    held = {"name": "R_s_ohm", "unit": "ohm", "measured": 3.601, "interval": 0.063, "held": 0.137, "factory": True}
+    run.add(Stage("identify", "pass", 1.0, values=values, comparison=[row, {**row, **held}]))
+    return report_page.report_page(run.path)
+
+
+@pytest.mark.chain
+@pytest.mark.skipif(find_browser() is None, reason="no browser on this computer")
+@pytest.mark.parametrize("paper_mm", [210.0, 215.9], ids=["A4", "Letter"])
+def test_on_paper_no_column_is_cut_off_and_no_number_is_broken(made: Path, tmp_path: Path, paper_mm: float) -> None:
+    """Before, ``2.000 +- 0.029 mN m s`` was printed as ``mN`` over ``m s``, ``9.2e-06`` as ``9.2e-`` over ``06``."""
+    page = page_with_values(RunDirectory(shutil.copytree(made, tmp_path / "run")))
+    margin_mm = float(re.search(r"@page { margin: \d+mm (\d+)mm", page)[1])  # type: ignore[index]
+    page = page.replace("@media screen", "@media speech").replace("@media print", "@media screen")
+    found = in_a_frame(
+        tmp_path, page, paper_mm - 2.0 * margin_mm,
+        "[page.body.scrollWidth > page.body.clientWidth ? 'page' : '',"
+        "...[...page.querySelectorAll('td, th')].filter(e => e.scrollWidth > e.clientWidth),"
+        "...[...page.querySelectorAll('td.number span')].filter(e => e.getClientRects().length > 1),"
+        "...[...page.querySelectorAll('thead')].filter(e => getComputedStyle(e).display != 'table-header-group')]"
+        ".map(e => e.textContent || e).join('|') + ' of ' + page.querySelectorAll('td.number span').length",
+    )  # fmt: skip
+    assert re.fullmatch(r" of (2\d|3\d)", found), found
+
+
 @pytest.mark.chain
 @pytest.mark.skipif(find_browser() is None, reason="no browser on this computer")
 def test_on_a_phone_no_part_is_wider_than_the_screen(made: Path, tmp_path: Path) -> None:
     """In a frame of 390 px; before, the hidden heads of the tables made the page 478 to 564 px wide."""
-    run = RunDirectory(shutil.copytree(made, tmp_path / "run"))
-    estimate = Estimate(3.6, 0.004, 0.06, "ohm", T_c=25.0, method="multi-level DC, asymptotic slope")
-    values = [{**value_facts("R_s_ohm", estimate), "accepted": True}]
-    run.add(Stage("identify", "pass", 1.0, values=values))
-    (tmp_path / "report.html").write_text(report_page.report_page(run.path), encoding="utf-8")
-    (tmp_path / "phone.html").write_text(
-        '<iframe id="phone" src="report.html" style="width:390px;height:800px;border:0"></iframe><pre id="out"></pre>'
-        '<script>document.getElementById("phone").onload = event => {'
-        "const page = event.target.contentDocument.documentElement;"
-        'document.getElementById("out").textContent = `${page.scrollWidth} ${page.clientWidth}`};</script>',
-        encoding="utf-8",
-    )
-    command = [
-        str(find_browser()), *QUIET, "--no-sandbox", f"--user-data-dir={tmp_path}/profile", "--window-size=800,900",
-        "--allow-file-access-from-files", "--virtual-time-budget=20000", "--dump-dom",
-    ]  # fmt: skip
-    page = (tmp_path / "phone.html").as_uri()
-    seen = subprocess.run([*command, page], capture_output=True, text=True, timeout=LIMIT_S, check=True).stdout
-    found = re.search(r'<pre id="out">(\d+) (\d+)</pre>', seen)
-    assert found is not None, seen[-500:]
-    assert int(found[1]) <= int(found[2]) <= 390
+    page = page_with_values(RunDirectory(shutil.copytree(made, tmp_path / "run")))
+    root = "page.documentElement"
+    found = in_a_frame(tmp_path, page, 390.0 * 25.4 / 96.0, f"`${{{root}.scrollWidth}} ${{{root}.clientWidth}}`")
+    wide, seen = map(int, found.split())
+    assert wide <= seen <= 390
