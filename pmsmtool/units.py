@@ -200,6 +200,22 @@ def _spelled_unit(spelled: str, dimension: str) -> tuple[Unit, int] | None:
     return None
 
 
+_SUFFIXES = {
+    "per_rpm_per_s": "1/(rpm/s)", "rpm_per_s": "rpm/s", "nm_per_s": "N m/s", "nms_per_rad": "N m s/rad",
+    "nm_per_rads": "N m/(rad s)", "nm_per_rad": "N m/rad", "rad_s": "rad/s", "rad_s2": "rad/s2", "rad_s3": "rad/s3",
+    "v_per_as": "V/(A s)", "v_per_a": "V/A", "per_s": "1/s", "rpm": "rpm", "rad": "rad", "deg": "deg", "hz": "Hz",
+    "db": "dB", "percent": "%", "nm": "N m",
+    "apk": "A peak", "a": "A", "v": "V", "s": "s", "wb": "Wb", "h": "H", "ohm": "ohm", "periods": "control periods",
+}  # fmt: skip
+
+
+def unit_of_key(key: str) -> str:
+    """Return the unit that a key ends in (``generation_rpm``), the longest there is; ``1`` where it ends in none."""
+    parts = key.split("_")
+    endings = ("_".join(parts[start:]) for start in range(1, len(parts)))
+    return next((_SUFFIXES[ending] for ending in endings if ending in _SUFFIXES), "1")
+
+
 def parse_quantity(text: str, dimension: str) -> float:
     """Return the SI value of a quantity written with its unit.
 

@@ -19,6 +19,7 @@ from pmsmtool.units import (
     format_quantity,
     parse_current,
     parse_quantity,
+    unit_of_key,
 )
 
 
@@ -187,3 +188,22 @@ def test_an_unknown_unit_is_asked_back(text, dimension, asked):
     with pytest.raises(ConfigError) as caught:
         parse_quantity(text, dimension)
     assert caught.value.likely.startswith(asked) and bool(caught.value.likely) == bool(asked)
+
+
+@pytest.mark.parametrize(
+    ("key", "unit"),
+    [
+        ("generation_rpm", "rpm"), ("closed_drive_slope_nm_per_s", "N m/s"), ("mtpva_i_d_a", "A"),
+        ("voltage_overshoot_per_rpm_per_s", "1/(rpm/s)"), ("ramp_that_spends_the_reserve_rpm_per_s", "rpm/s"),
+        ("axis_stiffness_nm_per_rads", "N m/(rad s)"), ("axis_K_v_per_s", "1/s"), ("closed_drive_rise_s", "s"),
+        ("sag_torque_share_n_max", "1"), ("rpm", "1"),
+    ],
+)  # fmt: skip
+def test_a_key_ends_in_its_unit(key: str, unit: str) -> None:
+    assert unit_of_key(key) == unit
+
+
+def test_the_units_of_keys_agree_with_the_catalogue() -> None:
+    """But for a current that the key marks as peak, and a number of periods."""
+    wrong = {p.name: (p.unit, unit_of_key(p.name)) for p in CATALOGUE if unit_of_key(p.name) not in ("1", p.unit)}
+    assert {name: pair for name, pair in wrong.items() if pair not in (("A", "A peak"), ("1", "control periods"))} == {}

@@ -110,9 +110,12 @@ def _written(found: Capabilities, denied: Mapping[str, str]) -> list[str]:
 
 def _unwritten(found: Capabilities, denied: Mapping[str, str]) -> dict[str, str]:
     """Return the mapped parameters that are not written all the same, and why."""
-    if found.map_is_drives:
-        return dict(denied)
-    return dict.fromkeys(found.drive_map.cells, "no map names this drive")
+    from pmsmtool.params.catalogue import OWN_SCALES
+
+    if not found.map_is_drives:
+        return dict.fromkeys(found.drive_map.cells, "no map names this drive")
+    own = [name for name in found.drive_map.cells if name in OWN_SCALES]
+    return {**denied, **dict.fromkeys(own, "the drive counts gains by it: compared with the machine, never written")}
 
 
 def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bool) -> list[str]:

@@ -362,7 +362,7 @@ def _show(run: RunDirectory, out: Output, begun: float, *, ended: bool = False) 
     report = f"report: {run.path / 'report.html'}"
     lines = [*(f"  - {line}" for line in found.details), *_TO_GO_ON.get(found.kind, ()), report, found.headline]
     if ended and not out.json:
-        for line in (report, found.headline.splitlines()[0]):
+        for line in (*lines[: len(found.details)], report, found.headline.splitlines()[0]):
             out.note(line)
     else:
         out.result("commission", data, lines)

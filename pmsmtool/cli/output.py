@@ -63,9 +63,12 @@ def jsonable(value: Any) -> Any:
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[object]], indent: int = 0) -> list[str]:
-    """Return the lines of :func:`plain_text.table`, on a terminal with cells broken to fit behind an indent."""
-    width = terminal_width(sys.stdout)
-    return plain_text.table(heads, rows, None if width is None else width - indent)
+    """Return the lines of :func:`plain_text.table`, cells broken to fit a terminal or a file, behind an indent."""
+    return plain_text.table(heads, rows, (terminal_width(sys.stdout) or FILE_WIDTH) - indent)
+
+
+FILE_WIDTH = 120
+"""Letters of a line of a table that goes to no terminal."""
 
 
 def terminal_width(stream: TextIO) -> int | None:

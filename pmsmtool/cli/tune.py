@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +15,11 @@ from pmsmtool.cli.options import DB, DEG, FILE, HZ, examples, options_named, out
 from pmsmtool.cli.output import Output, figure_format, save_figure, table
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import write_file
+from pmsmtool.units import unit_of_key
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
+    from pmsmtool.design.loops.sampled_loop import LoopMargins
     from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.params.parameter_set import ParameterSet
@@ -256,21 +258,14 @@ def _axis_lines(design: Design, params: ParameterSet, drive_map: DriveMap) -> It
     yield from table(("parameter", "value", "unit", "object", "method"), rows)
     yield ""
     box = ("phase_least_deg", "S_peak_db", "T_peak_db")
-    yield from table(
-        ("loop", "phase deg", "gain dB", "delay us", "bandwidth Hz", "least phase", "|S| dB", "|T| dB"),
-        [
-            (
-                name, f"{loop.phase_margin_deg:.1f}", f"{loop.gain_margin_db:.1f}", f"{1e6 * loop.delay_margin_s:.0f}",
-                f"{loop.bandwidth_rad_s / (2.0 * math.pi):.4g}",
-                *(f"{float(design.facts[f'{name}_{key}']):.1f}" for key in box),
-            )
-            for name in (SPEED_LOOP, POSITION_LOOP)
-            for loop in (design.loops[name],)
-        ],
-    )  # fmt: skip
+    judged = [
+        (*_loop(name, design.loops[name]), *(f"{float(design.facts[f'{name}_{key}']):.1f}" for key in box))
+        for name in (SPEED_LOOP, POSITION_LOOP)
+    ]
+    yield from table((*_LOOP, "least phase deg", "|S| dB", "|T| dB"), judged)
     yield ""
     facts = {name: fact for name, fact in design.facts.items() if name.startswith("axis_") and "_at" not in name}
-    yield from table(("axis", "value"), [(name, _fact(value)) for name, value in facts.items()])
+    yield from _facts("axis", facts)
 
 
 def _design(source: MachineFile, drive_map: DriveMap, asked: dict[str, Any]) -> Design:
@@ -339,25 +334,25 @@ def _lines(design: Design, drive_map: DriveMap) -> Iterator[str]:
     rows = [(name, f"{design[name]:.6g}", BY_NAME[name].unit, design.values[name].method) for name in shown]
     yield from table(("parameter", "value", "unit", "method"), rows)
     yield ""
-    yield from table(
-        ("loop", "phase deg", "gain dB", "delay us", "bandwidth Hz"),
-        [
-            (
-                name,
-                f"{loop.phase_margin_deg:.1f}",
-                f"{loop.gain_margin_db:.1f}",
-                f"{1e6 * loop.delay_margin_s:.0f}",
-                f"{loop.bandwidth_rad_s / (2.0 * math.pi):.4g}",
-            )
-            for name, loop in design.loops.items()
-            if not (polar and name.startswith("current"))
-        ],
-    )
+    loops = {name: loop for name, loop in design.loops.items() if not (polar and name.startswith("current"))}
+    yield from table(_LOOP, [_loop(name, loop) for name, loop in loops.items()])
     facts = {name: value for name, value in design.facts.items() if name.startswith("polar_") == polar}
     if facts:
         yield ""
-        head = "polar loops" if polar else "governor, field weakening, loops"
-        yield from table((head, "value"), [(name, _fact(value)) for name, value in facts.items()])
+        yield from _facts("polar loops" if polar else "governor, field weakening, loops", facts)
+
+
+_LOOP = ("loop", "phase deg", "gain dB", "delay us", "bandwidth Hz")
+
+
+def _loop(name: str, loop: LoopMargins) -> tuple[str, ...]:
+    delay_us, hertz = 1e6 * loop.delay_margin_s, loop.bandwidth_rad_s / (2.0 * math.pi)
+    return name, f"{loop.phase_margin_deg:.1f}", f"{loop.gain_margin_db:.1f}", f"{delay_us:.0f}", f"{hertz:.4g}"
+
+
+def _facts(head: str, facts: Mapping[str, bool | float | str]) -> list[str]:
+    units = [unit_of_key(name) if isinstance(value, float) else "" for name, value in facts.items()]
+    return table((head, "value", "unit"), list(zip(facts, map(_fact, facts.values()), units, strict=True)))
 
 
 def _fact(value: bool | float | str) -> str:

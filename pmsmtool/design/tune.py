@@ -37,7 +37,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.two_masses import shafts_of
+from pmsmtool.machine.two_masses import shafts_of, why_slower
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import SATURATION
 
@@ -247,15 +247,15 @@ def _design_speed(
     gains = _speed_gains(request, path, current.alpha)
     paths = [replace(path, shaft=shaft) for shaft in shafts_of(source)]
     if paths and request.speed_bandwidth_hz is None:
-        path, gains = paths[0], slowed(gains, paths)
+        rigid_rad_s, path, gains = gains.omega_c, paths[0], slowed(gains, paths)
+        notes = (*notes, *why_slower(source, rigid_rad_s, gains.omega_c))
     found = margins(speed_loop(gains, path))
     if not found.stable:
         raise DesignInfeasible(
             f"the speed loop with crossover {gains.omega_c / (2.0 * math.pi):.4g} Hz is unstable",
-            where="speed loop",
-            likely="too fast for its delays and filters",
+            where="speed loop", likely="too fast for its delays and filters",
             hint="ask for a lower --speed-bandwidth-hz, or raise the filter and the speed estimate",
-        )
+        )  # fmt: skip
     how = f"{gains.method}, {gains.omega_c / (2.0 * math.pi):.4g} Hz"
     slope, why = ACCELERATION_SHARE * rated.tau_max_nm / J * RPM, f"{ACCELERATION_SHARE:g} tau_max / J"
     if ramp_limit < math.inf and FW_SHARE * ramp_limit < slope:

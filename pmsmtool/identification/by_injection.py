@@ -80,7 +80,8 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         }
         for name, estimate in (found | timing | kept.ripples()).items()
     ]
-    summary = value_verdict.summary_of(kept, {name: e for name, e in found.items() if name not in rejected})
+    good = {name: estimate for name, estimate in found.items() if name not in rejected}
+    summary = value_verdict.summary_of(kept, good, request.quantities)
     return Stage(
         "identify",
         "partial" if missed and verdicts.status == "pass" else verdicts.status,

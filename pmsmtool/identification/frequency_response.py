@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.frequency_response import (
@@ -122,9 +123,11 @@ def save_response(run: RunDirectory, result: FrequencyResponse | None) -> dict[s
     return {RESPONSE_FILE: ""}
 
 
-def response_summary(result: FrequencyResponse | None) -> str:
-    """Return what a person reads of the response behind the other values."""
-    return "" if result is None else f"; frequency response: {result.reason.partition(':')[0]}"
+def response_summary(result: FrequencyResponse | None, refused: IdentificationError | None = None) -> str:
+    """Return what a person reads of the response behind the other values, or why it was refused."""
+    if result is None:
+        return "" if refused is None else f"; frequency response refused: {refused.reason}: {refused.what}"
+    return f"; frequency response: {result.reason.partition(':')[0]}"
 
 
 def response_note(result: FrequencyResponse | None) -> str:

@@ -73,17 +73,16 @@ def judged_values(found: Mapping[str, Estimate], machine: MachineFile | None) ->
     }
 
 
-def summary_of(evaluation: Evaluation, found: Mapping[str, Estimate]) -> str:
-    """Return the one line of the stage."""
+def summary_of(evaluation: Evaluation, found: Mapping[str, Estimate], asked: Sequence[str]) -> str:
+    """Return the one line of the stage; what was asked for and refused is said by its verdict."""
     values = ", ".join(
         f"{name} {format_estimate(found[name].value, total_half_width(found[name]), found[name].unit)}"
         for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb")
         if name in found
     )
-    more = flux_map.map_summary(evaluation.flux_map) + frequency_response.response_summary(
-        evaluation.frequency_response
-    )
-    return values + more
+    refused = None if "frf" in asked else evaluation.refused.get("frf")
+    response = frequency_response.response_summary(evaluation.frequency_response, refused)
+    return values + flux_map.map_summary(evaluation.flux_map) + response
 
 
 def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
@@ -124,9 +123,7 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
         lines.append(f"L: {'depends on frequency on ' + dependent if dependent else 'chi-square above its limit'}")
     if evaluation.flux_map is not None:
         lines += evaluation.flux_map.notes
-    if "frf" in request.quantities:
-        lines += filter(None, [frequency_response.response_note(evaluation.frequency_response)])
-    return lines
+    return [*lines, *filter(None, [frequency_response.response_note(evaluation.frequency_response)])]
 
 
 def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str, Any]:

@@ -35,7 +35,7 @@ FOLLOWS: Mapping[str, str] = {
     "psi": "a design goes on only with a machine file that states psi",
     "encoder": "torque needs the encoder offset: nothing that turns the shaft goes on",
     "poles": "torque needs the pole pairs: nothing that turns the shaft goes on",
-    "mechanics": "speed control needs J: without one in the machine file it is not designed",
+    "mechanics": "friction is not known; without J (mean acceleration, machine file) speed control is not designed",
     "map": "the design is made with constant inductances",
     "frf": "no resonance is known, and no notch is set",
     "cogging": "there is no table of its torque",

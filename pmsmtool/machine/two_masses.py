@@ -144,6 +144,16 @@ def shafts_of(source: MachineFile) -> list[Mechanics]:
     return [nominal, *(shaft for shaft in corners if shaft.antiresonance_hz < shaft.resonance_hz)]
 
 
+def why_slower(source: MachineFile, rigid_rad_s: float, slowed_rad_s: float) -> tuple[str, ...]:
+    """Return why a speed loop is slower than that of a rigid shaft (crossovers in rad/s); nothing where it is not."""
+    if slowed_rad_s >= rigid_rad_s:
+        return ()
+    swing_hz, f_r = source.conditions.get(SWING), source.machine.resonance_hz
+    shaft = f"swings at {f_r:.3g} Hz" if f_r else f"has play, and torque pulses swing it at {swing_hz:.3g} Hz"
+    rigid_hz, hz = rigid_rad_s / (2.0 * math.pi), slowed_rad_s / (2.0 * math.pi)
+    return (f"speed loop of {hz:.3g} Hz instead of {rigid_hz:.3g} Hz: the shaft {shaft}, where a faster loop hunts",)
+
+
 def _with_play(whole: Mechanics, swing_hz: float) -> list[Mechanics]:
     """Return one mass, and the elastic shafts that may swing so."""
     frequencies = (swing_hz / SWING_FACTOR, swing_hz, swing_hz * SWING_FACTOR)

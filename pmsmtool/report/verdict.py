@@ -119,7 +119,8 @@ def verdict_of(record: Mapping[str, Any], complete: Sequence[str] = COMPLETE) ->
     if ended == ExitCode.STOP_NOT_CONFIRMED:
         return Verdict("fail", STOP_NOT_CONFIRMED, (USE_HARDWARE_STOP, *failures, *accepted), simulated)
     if failures:
-        return Verdict("fail", "FAIL", (*failures, *accepted), simulated)
+        ran = [stage for stage in latest if stage["status"] in RAN]
+        return Verdict("fail", "FAIL", (*failures, *accepted, *_refused(ran)), simulated)
     ran = [stage for stage in latest if stage["status"] in RAN]
     left = [*unmeasured, *_unchecked(latest, complete)]
     missing = [*_missing(latest, complete), *_unfinished(account, latest)]
@@ -189,9 +190,14 @@ def _missing(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> li
         for stage in latest
         if stage["status"] != "pass" and not stage.get("refused")
     ]
-    lines += [f"{name}: refused: {why}" for stage in latest for name, why in (stage.get("refused") or {}).items()]
+    lines += _refused(latest)
     never = [name for name in complete if name not in found and len(complete) > 1]
     return [*lines, *([f"not run: {', '.join(never)}"] if never else [])]
+
+
+def _refused(stages: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return what was asked for and refused, each with its reason."""
+    return [f"{name}: refused: {why}" for stage in stages for name, why in (stage.get("refused") or {}).items()]
 
 
 def _unfinished(account: Mapping[str, Any], latest: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from pmsmtool.cli.help_topics import TOPICS
+from pmsmtool.cli.output import FILE_WIDTH
 from pmsmtool.plain_text import folded, table
 from tests.cli.conftest import Tool
 
@@ -53,6 +54,23 @@ def test_outside_a_terminal_a_line_stays_one_line(tool: Tool, monkeypatch: pytes
     _, out, _ = tool("caps", "--sim", "interior-2k2?drive=epos4")
     assert max(map(len, out.splitlines())) > WIDTH
     assert "needs mode 11 with commutation angle (0x6502 bit 10, 0x60EA)" in out
+
+
+def test_a_table_in_a_file_has_a_width_that_can_be_read(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, the table of the axis was as wide as its longest cell: 177 letters; of a check of the wiring 300."""
+    monkeypatch.setenv("COLUMNS", str(WIDTH))
+    code, out, _ = tool("tune", "interior-2k2", "-o", "axis.toml", "--axis", "--map", "epos4")
+    assert code in (0, 10) and "over the tolerance box" in out
+    assert 100 < max(map(len, out.splitlines())) <= FILE_WIDTH
+
+
+def test_tune_shows_every_number_with_its_unit(tool: Tool) -> None:
+    _, out, _ = tool("tune", "interior-2k2", "-o", "design.toml")
+    facts = out.split("governor, field weakening, loops")[1].splitlines()[1:]
+    units = {line.split()[0]: " ".join(line.split()[2:]) for line in facts}
+    assert units["current_bandwidth_rad_s"] == "rad/s" and units["maximum_delay_d_periods"] == "control periods"
+    assert units["voltage_overshoot_per_rpm_per_s"] == "1/(rpm/s)" and units["psi_f_at_T_magnet_max_wb"] == "Wb"
+    assert [name for name, unit in units.items() if not unit] == ["straight_segment"]
 
 
 @pytest.mark.parametrize(

@@ -27,8 +27,10 @@ from pmsmtool.design.loops.speed_loop import (
     symmetric_optimum,
     symmetric_ratio,
 )
+from pmsmtool.design.tune import tune
 from pmsmtool.errors import DesignInfeasible
-from pmsmtool.machine.two_masses import Mechanics
+from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.two_masses import SWING, Mechanics
 from tests.design.test_current_loop import scaled
 
 R, L_Q, T_S, J, B = 0.137, 2.1e-3, 1.0 / 12e3, 0.05, 0.01
@@ -195,3 +197,16 @@ def test_a_speed_loop_is_as_slow_as_an_elastic_shaft_needs() -> None:
     assert found.stable and found.modulus_margin >= ELASTIC_MODULUS
     assert slower.K_i / slower.K_p**2 == pytest.approx(rigid.K_i / rigid.K_p**2), "the same shape"
     assert slowed(rigid, [path()]) == rigid, "a rigid shaft needs nothing"
+
+
+def test_a_design_says_why_its_speed_loop_is_slow() -> None:
+    """Before, a gear with play was given 1.5 Hz without a word."""
+    rigid = load_machine_file("interior-2k2")
+    swinging = replace(rigid, conditions={**rigid.conditions, SWING: 140.0})
+    elastic = replace(
+        rigid, machine=replace(rigid.machine, resonance_hz=60.0, antiresonance_hz=20.0, resonance_zeta=0.01)
+    )
+    said = {name: " ".join(tune(source).notes) for name, source in (("play", swinging), ("elastic", elastic))}
+    assert "instead of 13.1 Hz: the shaft has play, and torque pulses swing it at 140 Hz" in said["play"]
+    assert "instead of 13.1 Hz: the shaft swings at 60 Hz, where a faster loop hunts" in said["elastic"]
+    assert "instead of" not in " ".join(tune(rigid).notes)

@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.noise import Noise
+from pmsmtool.estimators.refusals import refuse
 from pmsmtool.identification.evaluate import Evaluation
+from pmsmtool.identification.value_verdict import summary_of
 from pmsmtool.machine.parameters import Estimate
 
 PSI = 0.1
@@ -35,3 +38,14 @@ def test_a_second_method_alarms_where_it_makes_another_interval(apart: float, sy
     (check,) = evaluation(apart, systematic).checks
     assert check.difference == pytest.approx(apart)
     assert check.agrees == agrees
+
+
+def test_why_a_frequency_response_was_refused_is_in_the_line_of_the_stage() -> None:
+    """Before, `commission`, which measures it without being asked for it, did not say that there was none."""
+    refused = refuse("E_COHERENCE", "12 of 400 lines have a coherence of 0.9, 50 are needed", stage="frf")
+    bare = Evaluation(Noise(0.01, 0.0, 0.0))
+    without = replace(bare, refused={"frf": refused})
+    said = summary_of(without, {}, ("R", "L", "psi"))
+    assert said == f"; frequency response refused: E_COHERENCE: {refused.what}"
+    assert summary_of(without, {}, ("R", "frf")) == "", "the verdict on what was asked for says it"
+    assert summary_of(bare, {}, ("R",)) == ""

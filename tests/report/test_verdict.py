@@ -65,6 +65,14 @@ def test_wrong_wiring_comes_before_what_ran() -> None:
     assert f"encoder sign: refused: {why}" in found.details
 
 
+def test_a_failed_run_says_what_was_refused_before() -> None:
+    """Before, a proof that failed after refused mechanics ended without the reason of the refusal."""
+    identified = {**stage("identify", "partial"), "refused": {"mechanics": "E_MODEL_MISMATCH: the shaft is not rigid"}}
+    found = verdict_of(record(identified, stage("prove", "fail")))
+    assert found.headline.startswith("FAIL: prove: ")
+    assert found.details == ("mechanics: refused: E_MODEL_MISMATCH: the shaft is not rigid",)
+
+
 def test_an_identification_that_gave_a_part_is_partial_and_names_the_rest() -> None:
     identified = stage("identify", "partial")
     identified["values"] = [value for value in identified["values"] if value["name"] != "psi_f_wb"]
