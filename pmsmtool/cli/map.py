@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from pmsmtool.measurement.learn_gains import GainObject, LearnedLoop
 
 OBJECT = re.compile(r"0x([0-9A-Fa-f]{4})(?::0?x?([0-9A-Fa-f]{1,2}))?")
-STANDARD = {"speed.K_p_nms_per_rad": (0x60F9, 1), "speed.K_i_nm_per_rad": (0x60F9, 2)}
-"""Where CiA 402 puts the gains of the speed loop; what one count is worth it leaves to the maker."""
 SPEED_SHARE = 0.4
 """Speed limit without --speed-max, of the largest speed of the machine: no field weakening."""
 DURATION_S = 120.0
@@ -79,6 +77,7 @@ def learn_command(
     from pmsmtool.measurement.learn_gains import (
         GAIN,
         INTEGRAL,
+        gain_address,
         gain_object,
         learn_speed_loop,
         refuse_unsafe,
@@ -101,8 +100,7 @@ def learn_command(
         check_motion(node.map, drive.identity)
         found = {}
         for name in (GAIN, INTEGRAL):
-            address = asked.get(name) or (node.map.address(name) if name in node.map.cells else STANDARD[name])
-            found[name] = gain_object(node, name, *address)
+            found[name] = gain_object(node, name, *(asked.get(name) or gain_address(node, name)))
         speed_max = motion.speed_max_rad_s or SPEED_SHARE * rad_s_from_rpm(machine.n_max_rpm)
         i_max = within_budget(drive, machine, motion.i_max_apk or drive.rated_apk, speed_max)
         envelope = Envelope(
@@ -129,6 +127,7 @@ def learn_command(
 def _addresses(names: tuple[str, ...]) -> dict[str, tuple[int, int] | None]:
     """Return the wanted names with their objects, None where none is given."""
     from pmsmtool.errors import ConfigError
+    from pmsmtool.measurement.learn_gains import STANDARD
 
     asked: dict[str, tuple[int, int] | None] = {}
     for text in names:

@@ -2,7 +2,8 @@
 """A drive of another maker in profile position mode: it runs its own move, and shows demand, position and current.
 
 Demand (0x6062) and position (0x6064) come in one sample: their difference is the drive's own following error, without
-any delay of the bus. The position loop is the drive's own: every stop removes the voltage.
+any delay of the bus. A drive without demand shows that error (0x60F4). The position loop is the drive's own: every stop
+removes the voltage.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits
+from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.process_data import LiveValues, live_values
-from pmsmtool.drive.set_point import POSITION_DEMAND, TARGET_POSITION, WHOLE, start_move
+from pmsmtool.drive.set_point import FOLLOWING_ERROR, POSITION_DEMAND, TARGET_POSITION, WHOLE, start_move
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S
 from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
@@ -53,18 +55,20 @@ class PositionDrive(TorqueDrive):
     Raises
     ------
     NotAvailable
-        The drive has no profile position mode, or does not show its demand.
+        The drive has no profile position mode, or shows neither its demand nor its following error.
     """
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)
         modes = int(self.node.held(objects.SUPPORTED_MODES) or 0)
+        self._by_error = self.node.held(POSITION_DEMAND) is None
+        shown = not self._by_error or self.node.held(FOLLOWING_ERROR) is not None
         lacking = [
             what
             for what, has in (
                 ("profile position mode (bit 0 of 0x6502)", modes & 1),
                 ("a target position (0x607A)", self.node.held(TARGET_POSITION) is not None),
-                ("its position demand (0x6062)", self.node.held(POSITION_DEMAND) is not None),
+                ("its position demand (0x6062) or following error (0x60F4)", shown),
             )
             if not has
         ]
@@ -135,7 +139,13 @@ class PositionDrive(TorqueDrive):
 
     def demanded_rad(self) -> float:
         """Return the demand as the drive shows it now, from where the shaft stood when it was enabled."""
-        return self._angle(self.node.get(POSITION_DEMAND) - self._start_counts)
+        demand = self.node.get(self._demand) + (self.node.get(POSITION) if self._by_error else 0.0)
+        return self._angle(demand - self._start_counts)
+
+    @property
+    def _demand(self) -> DriveObject:
+        """What shows the demand: itself, or what is added to the position."""
+        return FOLLOWING_ERROR if self._by_error else POSITION_DEMAND
 
     def _angle(self, counts: float) -> float:
         return 2.0 * math.pi * (counts - round(counts / WHOLE) * WHOLE) / self.counts_per_turn
@@ -150,7 +160,7 @@ class PositionDrive(TorqueDrive):
     def begin_samples(self) -> None:
         """Note demand, position and current every millisecond from now on; asked for where they cannot be sent."""
         self._taken, self._recording = [], True
-        items = {"position": POSITION, "demand": POSITION_DEMAND, "current": self._current.item}
+        items = {"position": POSITION, "demand": self._demand, "current": self._current.item}
         sending = live_values(self.node, SHOWN, POLL_PERIOD_S, items)
         try:
             live = sending.__enter__()
@@ -195,7 +205,7 @@ class PositionDrive(TorqueDrive):
         end = clock.now() + seconds
         while self._recording and not self.sends and clock.now() < end:
             now = clock.now()
-            self._take(now, *(self.node.get(item) for item in (POSITION, POSITION_DEMAND, self._current.item)))
+            self._take(now, *(self.node.get(item) for item in (POSITION, self._demand, self._current.item)))
         super().wait(max(0.0, end - clock.now()))
         if self._taken and self._recording:
             error = self.lag_rad()
@@ -215,5 +225,6 @@ class PositionDrive(TorqueDrive):
         return math.copysign(1.0, error) * (self._taken[-1][1] - before[1]) > FOLLOWS_SHARE * self.error_limit_rad
 
     def _take(self, t_s: float, position: float, demand: float, current: float) -> None:
+        demand += position if self._by_error else 0.0
         angles = (self._angle(counts - self._start_counts) for counts in (position, demand))
         self._taken.append((t_s, *angles, current * self._current.per_count))  # type: ignore[arg-type]

@@ -11,6 +11,8 @@ from pmsmtool.errors import DriveTimeout
 
 TARGET_POSITION = DriveObject(0x607A, 0, "i")
 POSITION_DEMAND = DriveObject(0x6062, 0, "i")
+FOLLOWING_ERROR = DriveObject(0x60F4, 0, "i")
+"""Demand less position, as of the same instant (CiA 402-2)."""
 NEW_SET_POINT, ACKNOWLEDGED = 0x0010, 0x1000
 """Bits of controlword and statusword in profile position mode (CiA 402-2, 11.4)."""
 ACKNOWLEDGE_S = 0.5

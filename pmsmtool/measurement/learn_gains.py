@@ -8,6 +8,7 @@ down. The drive holds its own gains again when this ends, and the next connectio
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -29,6 +30,11 @@ from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.measurement.speed_unit import find_speed_unit
 
 GAIN, INTEGRAL = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"
+STANDARD = {GAIN: (0x60F9, 1), INTEGRAL: (0x60F9, 2)}
+"""Where CiA 402 puts the gains of the speed loop; what one count is worth it leaves to the maker."""
+ADDRESS = re.compile(r"0x([0-9A-F]{4}):([0-9A-F]{2})")
+HOLDS = re.compile(r" (?:has|holds) ")
+"""Reasons why a map leaves a gain out begin with its objects: "0x2331:01 or 0x60F9:01 has no unit ..."."""
 DOWN = 0.7
 """First change of a gain."""
 INTEGRAL_DOWN = 0.8
@@ -87,6 +93,28 @@ class LearnedLoop:
     integral_changed: Sequence[Observation]
     speed_unit_rad_s: float
     notes: Sequence[str]
+
+
+def gain_address(node: DriveNode, name: str) -> tuple[int, int]:
+    """Return where a drive keeps a gain: by its map, by what the map says of a gain without unit, else by CiA 402.
+
+    Raises
+    ------
+    NotAvailable
+        The drive has none of these objects.
+    """
+    if name in node.map.cells:
+        return node.map.address(name)
+    places = ADDRESS.findall(HOLDS.split(node.map.left_out.get(name, ""))[0])
+    told = [(int(index, 16), int(sub, 16)) for index, sub in places]
+    for address in (*told, STANDARD[name]):
+        if node.has(*address):
+            return address
+    known = " or ".join(f"0x{index:04X}:{sub:02X}" for index, sub in dict.fromkeys((*told, STANDARD[name])))
+    raise NotAvailable(
+        f"no object of this drive is known to hold {name}: it has no {known}", where=f"node {node.node}",
+        hint=f"where its manual names one: `pmsmtool map learn {name}=0xINDEX:SUB`",
+    )  # fmt: skip
 
 
 def gain_object(node: DriveNode, name: str, index: int, sub: int, wire: str | None = None) -> GainObject:

@@ -18,7 +18,7 @@ from pmsmtool.machine.profile import machine_path
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 from tests.cli.conftest import Tool
-from tests.foreign.data_sheets import Row, epos4, faulhaber, unknown, write_eds
+from tests.foreign.data_sheets import COMMON, HEARTBEAT, Row, epos4, faulhaber, identity, unknown, write_eds
 
 POSITION: tuple[Row, ...] = (
     (0x1010, 1, "U32", "rw", "1"), (0x6062, 0, "I32", "ro", "0"), (0x607A, 0, "I32", "rw", "0"),
@@ -122,6 +122,51 @@ def test_a_profile_of_unknown_unit_is_found_by_the_demand(tool: Tool, tmp_path: 
     assert code == 2 and "both --speed and --acceleration" in said
     code, printed, _ = tool("-n", "1", "param", "get", "0x6083", *channel)
     assert ramp in printed
+
+
+OWN_MAP = """
+schema = "pmsmtool.drive-map/1"
+name = "own"
+vendor = 0x1234
+product = 0x5678
+staging = false
+[capabilities]
+pdo = true
+[objects]
+[motion]
+counts_per_turn = { number = 131072, source = "plate" }
+[sources]
+plate = "name plate"
+"""
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("shows", [0x6062, 0x60F4])
+def test_a_drive_of_position_modes_alone_gives_its_inertia(tool: Tool, tmp_path: Path, shows: int) -> None:
+    """Modes 1, 6 and 7 and no units: its owner states the increments of a turn in a map that names the drive."""
+    rows = (
+        *COMMON, *HEARTBEAT, *identity(0x1234, 0x5678), (0x6073, 0, "U16", "rw", "1000"), (0x6075, 0, "U32", "rw", ""),
+        (0x6077, 0, "I16", "ro", ""), (shows, 0, "I32", "ro", ""), (0x607A, 0, "I32", "rw", "0"),
+        (0x6081, 0, "U32", "rw", "10000"), (0x6083, 0, "U32", "rw", ""), (0x6502, 0, "U32", "ro", "0x43"),
+    )  # fmt: skip
+    (tmp_path / "own.toml").write_text(OWN_MAP)
+    channel = f"interior-2k2?eds={write_eds(tmp_path / 'own.eds', rows)}&nv=:memory:"
+    asked = (
+        "--by",
+        "60deg",
+        "--speed",
+        "150rpm",
+        "--acceleration",
+        "60",
+        "--identify",
+        "interior-2k2",
+        "--settle",
+        "0.2s",
+    )
+    code, printed, said = tool("move", *asked, "--map", "own.toml", "--sim", channel, "--yes", "--json")
+    assert code == 0, said
+    inertia = json.loads(printed)["identified"]["J_kgm2"]
+    assert abs(inertia["value"] - J) < inertia["systematic"] + 2.0 * inertia["std"] < 0.05 * J
 
 
 def first_move(trace: Trace) -> tuple[Array, Array]:

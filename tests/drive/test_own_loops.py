@@ -20,7 +20,7 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.position_drive import PositionDrive
-from pmsmtool.drive.set_point import ACKNOWLEDGE_S, POSITION_DEMAND, TARGET_POSITION, start_move
+from pmsmtool.drive.set_point import ACKNOWLEDGE_S, FOLLOWING_ERROR, POSITION_DEMAND, TARGET_POSITION, start_move
 from pmsmtool.drive.speed_loop_drive import LARGEST_COUNT, OSCILLATION_SAMPLES, Oscillation, SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.motion_objects import MotionObject
@@ -152,6 +152,23 @@ def test_samples_are_asked_for_where_they_cannot_be_sent() -> None:
         assert trace["theta_m_rad"][-1] == pytest.approx(1e4 * (trace.t_s[-1] + began) * per_count, rel=0.02)
         assert trace["theta_ref_rad"][-1] == pytest.approx(2e4 * (trace.t_s[-1] + began) * per_count, rel=0.02)
         assert trace["i_q_a"] == pytest.approx(0.5 * RATED_APK)
+
+
+def test_without_a_demand_the_following_error_tells_it() -> None:
+    held = {item: value for item, value in HELD.items() if item is not POSITION_DEMAND}
+    with opened({**held, motion.POSITION: 1000, FOLLOWING_ERROR: 0}) as (table, connection):
+        drive = PositionDrive(connection, NODE, drive_map=GENERIC)
+        drive.enable()
+        table.shown[motion.POSITION] = lambda: 1400
+        table.shown[FOLLOWING_ERROR] = lambda: -150
+        quarter = 0.5 * math.pi / 1000.0
+        assert drive.demanded_rad() == pytest.approx(250 * quarter)
+        drive.begin_samples()
+        drive.wait(0.02)
+        trace = drive.end_samples()
+        assert trace["theta_m_rad"] == pytest.approx(400 * quarter)
+        assert trace["theta_ref_rad"] == pytest.approx(250 * quarter)
+        assert drive.lag_rad() == pytest.approx(-150 * quarter)
 
 
 def test_a_record_without_a_sample_is_empty() -> None:

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: MIT
+"""Where `map learn` looks for the gains of a speed loop when nobody names their objects."""
+
+from __future__ import annotations
+
+import pytest
+
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive_maps.shipped_maps import load_family
+from pmsmtool.errors import NotAvailable
+from pmsmtool.measurement.learn_gains import GAIN, INTEGRAL, gain_address
+from tests.drive.table_drive import node_of
+
+
+@pytest.mark.parametrize(
+    ("family", "there", "gain", "integral"),
+    [
+        ("zeroerr", 0x2381, (0x2381, 1), (0x2381, 2)), ("nanotec", 0x3210, (0x3210, 3), (0x3210, 4)),
+        ("faulhaber", 0x2331, (0x2331, 1), (0x2331, 2)), ("faulhaber", 0x60F9, (0x60F9, 1), (0x60F9, 2)),
+        ("copley", 0x60F9, (0x60F9, 1), (0x60F9, 2)), ("epos4", 0, (0x30A2, 1), (0x30A2, 2)),
+        ("cia402", 0x60F9, (0x60F9, 1), (0x60F9, 2)),
+    ],
+)  # fmt: skip
+def test_the_maps_own_reason_names_the_object(
+    family: str, there: int, gain: tuple[int, int], integral: tuple[int, int]
+) -> None:
+    held = {DriveObject(there, sub, "H"): 7.0 for sub in (1, 2, 3, 4)} if there else {}
+    with node_of(held, load_family(family)) as (_, node):
+        assert (gain_address(node, GAIN), gain_address(node, INTEGRAL)) == (gain, integral)
+
+
+@pytest.mark.parametrize(
+    ("family", "named"), [("cia402", "it has no 0x60F9:01"), ("zeroerr", "it has no 0x2381:01 or 0x60F9:01")]
+)
+def test_a_drive_without_such_an_object_is_told_so(family: str, named: str) -> None:
+    """The shift of Copley's gain (0x60F9:04) is no gain."""
+    with node_of({DriveObject(0x60F9, 4, "h"): 1.0}, load_family(family)) as (_, node):
+        with pytest.raises(NotAvailable) as caught:
+            gain_address(node, GAIN)
+        assert named in caught.value.what and "0xINDEX:SUB" in caught.value.hint
