@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.options import (
-    NODE,
-    BusOptions,
-    MotionOptions,
-    bus_options,
-    examples,
-    output_options,
-    write_options,
-)
+from pmsmtool.cli.options import NODE, BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:

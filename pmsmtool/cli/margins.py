@@ -207,15 +207,7 @@ def _sample(sample: Mapping[str, float]) -> str:
 
 def _table(spreads: Sequence[Spread] | Sequence[Observed], worst: str = "worst corner") -> list[str]:
     random = bool(spreads and spreads[0].percentiles)
-    heads = [
-        "quantity",
-        "unit",
-        "nominal",
-        worst,
-        *(["p1", "p5", "p50"] if random else []),
-        "asked",
-        "verdict",
-    ]
+    heads = ["quantity", "unit", "nominal", worst, *(["p1", "p5", "p50"] if random else []), "asked", "verdict"]
     rows = []
     for s in spreads:
         shares = [f"{s.percentiles[p]:.4g}" for p in (1.0, 5.0, 50.0)] if random else []

@@ -21,15 +21,7 @@ from pmsmtool.cli.drive_access import (
     read_map,
     warn_of_other_drive,
 )
-from pmsmtool.cli.options import (
-    FILE,
-    BusOptions,
-    MotionOptions,
-    bus_options,
-    examples,
-    output_options,
-    write_options,
-)
+from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output, table
 from pmsmtool.plain_text import counted
 
