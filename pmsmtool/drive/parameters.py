@@ -11,7 +11,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum
+from functools import partial
 
+from pmsmtool.bus.busy import when_ready
 from pmsmtool.bus.sdo import Mode, Retry
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import NOT_READ, DriveNode
@@ -25,6 +27,8 @@ from pmsmtool.plain_text import counted
 
 Progress = Callable[[int, int], None]
 """Called with objects done and objects in all."""
+BUSY_S = 0.5
+"""A value that the drive is too busy to take is written again for so long."""
 
 
 class SetCommand(IntEnum):
@@ -225,19 +229,23 @@ class DriveParameters:
         self._write_all(new, _no_progress)
 
     def _write_all(self, new: Mapping[str, bytes], progress: Progress) -> None:
-        refused = []
+        refused, hints = [], set()
         total = 2 * len(new)
+        patience_s = BUSY_S
         for count, (name, data) in enumerate(new.items(), 1):
+            write = partial(self.node.sdo.download, *self.map.address(name), data)
             try:
-                self.node.sdo.download(*self.map.address(name), data)
+                when_ready(self.node.connection, write, patience_s)
             except SdoAbort as abort:
                 refused.append(f"{name} ({abort.where}): {abort.what}{f'; {abort.likely}' if abort.likely else ''}")
+                hints.add(abort.hint)
+                patience_s = 0.0  # an enabled drive refuses every one as if it were busy
             progress(count, total)
         if refused:
             raise DriveFault(
                 "\n  - ".join([f"the drive refused {len(refused)} of {counted(len(new), 'value')}", *refused]),
                 where=f"node {self.node.node}",
-                hint="`pmsmtool param help NAME` shows the limits",
+                hint="; ".join(sorted(hints)),
             )
         found = self.read(new, progress=lambda done, count: progress(count + done, total))
         wrong = [

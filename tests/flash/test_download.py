@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.busy import BUSY_POLL_S
 from pmsmtool.bus.supervision import SecondMaster
-from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.drive.parameters import BUSY_S, DriveParameters
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap, reference_map
 from pmsmtool.errors import (
@@ -273,6 +275,33 @@ def test_refused_store_brings_the_old_set_back(tmp_path: Path) -> None:
     with pytest.raises(DriveFault, match="holds exactly the old set again"):
         rig.download(SMALL)
     assert rig.image() == before
+
+
+@pytest.mark.parametrize("always", [False, True])
+def test_a_drive_that_is_busy_for_a_value_is_asked_again(rig: Rig, always: bool) -> None:
+    """One such answer had ended the download; each of an enabled drive is waited for once, not for every value."""
+    assert rig.bench.node.session is not None
+    asked = []
+
+    def busy(data: bytes) -> None:
+        asked.append(data)
+        if always or len(asked) == 1:
+            raise Refused(AbortCode.DEVICE_STATE)
+        kept(data)
+
+    entries = [rig.bench.node.session.dictionary[name] for name in ("motor.R_s_ohm", "motor.L_d_h")]
+    kept = entries[0].sink
+    for entry in entries if always else entries[:1]:
+        entry.sink = busy
+    if not always:
+        assert rig.download(SMALL).written == 4 and len(asked) == 2
+        return
+    begun = rig.connection.clock.now()
+    with pytest.raises(DriveFault, match="refused 2 of 4 values") as caught:
+        rig.download(SMALL)
+    assert "stop" in caught.value.hint and "limits" not in caught.value.hint
+    assert rig.connection.clock.now() - begun < 2.0 * BUSY_S
+    assert 0.5 * BUSY_S / BUSY_POLL_S < len(asked) < 2.0 * BUSY_S / BUSY_POLL_S
 
 
 @pytest.mark.parametrize("saved_before", [False, True])
