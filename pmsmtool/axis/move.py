@@ -141,7 +141,7 @@ class MoveDifference:
     @property
     def shown_ratio(self) -> str:
         """The ratio as people read it."""
-        return f"{self.ratio:.3g}" if math.isfinite(self.ratio) else "-"
+        return f"{self.ratio:.3g}" if math.isfinite(self.ratio) and math.isfinite(self.first) else "-"
 
 
 Rows = Iterable[Mapping[str, Any]]

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode, State
 from pmsmtool.drive import objects, stop
@@ -194,9 +195,11 @@ class CanopenDrive:
         try:
             self.node.put(objects.MODE, mode)
         except SdoAbort as abort:
+            untuned = "the loop of this mode has no gains yet: `tune` and `flash-params` give it some"
             raise NotAvailable(
                 f"the drive has no mode of operation{_mode_name(mode)} ({int(mode)})",
                 where=f"node {self.node.node}, 0x6060:00",
+                likely=untuned if abort.code == AbortCode.DEVICE_STATE else "",
                 hint="`pmsmtool caps` lists what this drive can measure",
             ) from abort
         clock = self.node.connection.clock

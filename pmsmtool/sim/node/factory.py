@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.sim.node.face import DriveFace
+from pmsmtool.sim.node.family_position import calm_gains
 from pmsmtool.sim.node.node import Settings
 from pmsmtool.sim.node.parameter_set import ParameterImage
 from pmsmtool.sim.simulated_machine import settings_of
@@ -80,6 +81,7 @@ def set_up_values(machine_file: MachineFile) -> dict[str, float]:
         "encoder.offset_rad": number("encoder_offset_rad"),
         "encoder.reversed": float(truth.flag("encoder_reversed")),
     }
+    values |= calm_gains(number("J_kgm2") + number("J_load_kgm2"))
     for axis in "dq":
         inductance = number(f"L_{axis}_h")
         values |= {f"motor.L_{axis}_h": inductance, f"motor.L_{axis}_app_h": inductance}

@@ -21,6 +21,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, TORQUE_PER_AMPERE
 from pmsmtool.sim.node import own_identification
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+from pmsmtool.sim.node.family_position import INCREMENTS, PID, PROFILE, SPEED, PositionSide, pid_of
 from pmsmtool.sim.node.monitor import Monitor
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.power_drive import Plant, PowerDrive
@@ -42,6 +43,7 @@ ONE_FOR_BOTH_AXES = {
 }
 """Where a family has one object only, its value acts on these as well."""
 MODE_BITS = {
+    Mode.PROFILE_POSITION: 0,
     Mode.PROFILE_VELOCITY: 2,
     Mode.PROFILE_TORQUE: 3,
     Mode.CYCLIC_VELOCITY: 8,
@@ -97,7 +99,12 @@ class Face:
         has = self.drive_map.capabilities
         torque = (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE) if has.torque_mode else ()
         velocity = (Mode.PROFILE_VELOCITY, Mode.CYCLIC_VELOCITY) if has.velocity_mode else ()
-        return (*velocity, *torque, *((Mode.CYCLIC_TORQUE_ANGLE,) if has.commutation_angle else ()))
+        return (
+            Mode.PROFILE_POSITION,
+            *velocity,
+            *torque,
+            *((Mode.CYCLIC_TORQUE_ANGLE,) if has.commutation_angle else ()),
+        )
 
     def dress(self, dictionary: Dictionary) -> None:
         """Put the family's objects into a dictionary whose application is not hooked up yet."""
@@ -115,7 +122,8 @@ class Face:
             dictionary["identity.revision"].put(revisions[-1] << 16)
         tuning = self.drive_map.vendor_tuning
         own = () if tuning is None else (tuning.mode,)
-        for entry in (*_modes(self.modes, dictionary, own), *_Parameters(self.drive_map, dictionary).entries()):
+        parameters = _Parameters(self.drive_map, dictionary)
+        for entry in (*_modes(self.modes, dictionary, own, parameters.choose), *parameters.entries()):
             dictionary.show(entry)
 
     def attach(self, dictionary: Dictionary, plant: Plant, power: PowerDrive, schedule: Schedule) -> None:
@@ -167,11 +175,13 @@ class Reduced:
                 dictionary.show(entry)
 
 
-def _modes(modes: Sequence[Mode], dictionary: Dictionary, own: Sequence[int] = ()) -> Iterator[Entry]:
+def _modes(
+    modes: Sequence[Mode], dictionary: Dictionary, own: Sequence[int] = (), chosen: Callable[[], None] = lambda: None
+) -> Iterator[Entry]:
     """Yield the objects of the modes of operation, without those the drive does not have.
 
     Torque with the master's commutation angle is the reference drive's current set-point at a fixed angle; a mode of
-    the maker's ``own`` is its identification mode without any set-point.
+    the maker's ``own`` is its identification mode without any set-point. ``chosen`` is told of every choice.
     """
     inner = dictionary["cia402.mode"]
     shown = Entry(_row(0x6060, 0, "INTEGER8", "Modes of operation", "rw", "R", True), 0)
@@ -184,6 +194,7 @@ def _modes(modes: Sequence[Mode], dictionary: Dictionary, own: Sequence[int] = (
         behind = Mode.IDENTIFICATION if mode in (Mode.CYCLIC_TORQUE_ANGLE, *own) else mode
         dictionary.write(inner, inner.encode(behind))
         shown.value = data
+        chosen()
 
     shown.sink = sink
     display.source = lambda: shown.value
@@ -223,11 +234,23 @@ class _Parameters:
         self._map = drive_map
         self._dictionary = dictionary
         self._shown: dict[str, Entry] = {}
+        self._side = PositionSide(dictionary, self._held) if PID[0] in drive_map.cells else None
+
+    def choose(self) -> None:
+        """Let the gains of a mode act that was chosen."""
+        if self._side is not None:
+            self._side.apply()
+
+    def _held(self, name: str) -> float:
+        """Return what the family's object holds (SI)."""
+        cell = self._map.cells[name]
+        values = {cell.gain: self._number(cell.gain)} if cell.gain else {}
+        return float(cell.decode(self._source(cell)(), values))
 
     def entries(self) -> Iterator[Entry]:
         """Make the entries."""
         for cell in self._map.cells.values():
-            if cell.index in STANDARD and self._has(cell):
+            if cell.index in STANDARD and self._has(cell) and cell.name not in PROFILE:
                 continue  # works as the standard says, for every family
             parameter = BY_NAME[cell.name]
             row = _row(cell.index, cell.sub, cell.wire, parameter.meaning, "rw", "R" if parameter.live else "0", True)
@@ -263,15 +286,27 @@ class _Parameters:
         """Return a value of the drive behind (SI); what that has no object for is as its maker's tool leaves it."""
         if name in self._dictionary.by_key:
             return self._dictionary[name].number()
+        if name in PROFILE:
+            return self._dictionary[PROFILE[name]].number() / self._per_rpm()
+        if name == INCREMENTS:
+            return self._dictionary["cia402.encoder_counts"].number()
+        if name in PID:
+            return pid_of(*(self._dictionary[key].number() for key in (*SPEED, "position.K_p_per_s")))[name]
         if name == TORQUE_PER_AMPERE:  # amperes are peak here, as everywhere behind
             poles, flux = (self._dictionary[f"motor.{key}"].number() for key in ("pole_pairs", "psi_f_wb"))
             return 1.5 * poles * flux
         return BY_NAME[name].default
 
+    def _per_rpm(self) -> float:
+        """Return increments per second of 1 rpm."""
+        return self._dictionary["cia402.encoder_counts"].number() / 60.0
+
     def _sink(self, cell: Cell) -> Callable[[bytes], None]:
         def write(data: bytes) -> None:
             self._act(cell, data)
             self._shown[cell.name].value = bytes(data)
+            if cell.name in (*PID, *SPEED):
+                self.choose()
             for other in self._map.cells.values():
                 if other.gain == cell.name and other.name in self._shown and self._shown[other.name].value:
                     self._follow(other)
@@ -294,6 +329,12 @@ class _Parameters:
         if not math.isfinite(value):
             raise Refused(AbortCode.VALUE)
         others = [name for name in ONE_FOR_BOTH_AXES.get(cell.name, ()) if name not in self._map.cells]
+        if cell.name in PROFILE:
+            inner = self._dictionary[PROFILE[cell.name]]
+            self._dictionary.write(inner, inner.encode(value * self._per_rpm()))
+            return
+        if cell.name in SPEED and self._side is not None:
+            return  # acts with its mode
         for name in (cell.name, *others):
             if name not in self._dictionary.by_key:
                 continue  # kept for the family, without effect on the drive behind
