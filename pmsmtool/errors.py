@@ -167,7 +167,7 @@ class LimitExceeded(SafetyRefusal):
     """A quantity is outside its safety limit."""
 
     def __init__(self, quantity: str, value: float, limit: float, unit: str, **said: Unpack[Said]) -> None:
-        super().__init__(f"{quantity} {value:.6g} {unit} is outside the limit {limit:.6g} {unit}", **said)
+        super().__init__(f"{quantity} {value:.4g} {unit} is outside the limit {limit:.4g} {unit}", **said)
         self.quantity = quantity
         self.value = value
         self.limit = limit

@@ -146,6 +146,13 @@ def test_the_first_steps_with_an_own_drive_are_what_the_program_says(
         assert_printed(typed, shown)
 
 
+def test_the_file_of_bus_options_is_one_that_is_read_on_every_system() -> None:
+    """Before, the page named `can.ini`, which python-can reads on Windows alone."""
+    from can.util import CONFIG_FILES
+
+    assert CONFIG_FILES[0] == "~/can.conf" and "the file `can.conf` in your home folder" in PAGES["your-drive.md"]
+
+
 def test_python_blocks_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.chdir(ROOT)
     for text in PAGES.values():

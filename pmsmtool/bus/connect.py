@@ -45,7 +45,7 @@ def connect(
     Parameters
     ----------
     interface, channel, bitrate
-        As for ``can.Bus``; None is not passed on, so ``~/.canrc``, ``can.ini`` and ``CAN_*`` decide.
+        As for ``can.Bus``; None is not passed on, so ``~/can.conf``, ``~/.canrc`` and ``CAN_*`` decide.
     trace : Path, optional
         Record every frame there; the suffix chooses the format.
     **options
@@ -119,7 +119,7 @@ def _open_failure(arguments: Mapping[str, Any], error: Exception) -> PmsmtoolErr
     if name is None and isinstance(error, can.CanInterfaceNotImplementedError):
         return BusError(
             "no CAN interface is configured",
-            likely="neither -i/-c nor python-can's own configuration (~/.canrc, can.ini, CAN_INTERFACE) names one",
+            likely="neither -i/-c nor python-can's own configuration (~/can.conf, CAN_INTERFACE) names one",
             hint="-i pmsmsim for the simulated drive, or -i and -c of your adapter; `pmsmtool doctor` lists adapters",
         )
     known = can.VALID_INTERFACES

@@ -13,6 +13,7 @@ import click
 from pmsmtool.cli.drive_access import LOOKING_S, map_option, open_node, read_map, rehearsal_bus
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.plain_text import by_reason
 
 if TYPE_CHECKING:
     from pmsmtool.measurement.capabilities import Capabilities, Row
@@ -113,7 +114,7 @@ def _unwritten(found: Capabilities, denied: Mapping[str, str]) -> dict[str, str]
     from pmsmtool.params.catalogue import OWN_SCALES
 
     if not found.map_is_drives:
-        return dict.fromkeys(found.drive_map.cells, "no map names this drive")
+        return dict.fromkeys(found.drive_map.cells, "this map does not name this drive")
     own = [name for name in found.drive_map.cells if name in OWN_SCALES]
     return {**denied, **dict.fromkeys(own, "the drive counts gains by it: compared with the machine, never written")}
 
@@ -125,6 +126,9 @@ def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bo
     drive_map = found.drive_map
     others = len(drive_map.not_written(BY_NAME).keys() - drive_map.left_out.keys())
     unwritten = _unwritten(found, denied)
+    reasons = (
+        (drive_map.row_text(name) if sources or found.map_is_drives else name, why) for name, why in unwritten.items()
+    )
     written = {name: drive_map.cells[name] for name in _written(found, denied)}
     rows = [(f"written: {name}", f"0x{row.index:04X}:{row.sub:02X}", row.wire) for name, row in written.items()]
     lines = [f"written: {drive_map.row_text(name)}" for name in written] if sources else table(("", "", ""), rows)[1:]
@@ -132,7 +136,7 @@ def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bo
         "",
         "of a set, `flash-params` writes what is listed here as written; nothing is written now",
         *lines,
-        *(f"not written: {drive_map.row_text(name)}: {why}" for name, why in unwritten.items()),
+        *(f"not written: {line}" for line in by_reason(reasons)),
         *(f"not written: {name}: {why}" for name, why in drive_map.left_out.items() if name in BY_NAME),
         *([f"not written: {others} other parameters, which the map has no row for"] if others else []),
     ]
@@ -140,8 +144,6 @@ def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bo
 
 def _lines(found: Capabilities, denied: Mapping[str, str], sources: bool) -> list[str]:
     """Return what a person reads: what is had, then what is missing and for what, then what is written."""
-    from pmsmtool.plain_text import by_reason
-
     identity = found.identity
     lines = [
         f"node {identity.node}  {identity.name}  vendor {identity.vendor:#010x}  product {identity.product:#x}  "

@@ -89,7 +89,7 @@ def _examined(bus: BusOptions, find_bitrate: bool, listen_s: float) -> tuple[dic
         lines += _finding_lines(result)
         failed = "; ".join(text.partition(";")[0] for verdict, text in result.findings if verdict == "FAIL")
     else:
-        lines.append("no bus is configured: give -i and -c, or configure python-can (~/.canrc, CAN_INTERFACE)")
+        lines.append("no bus is configured: give -i and -c, or configure python-can (~/can.conf, CAN_INTERFACE)")
     return data, lines, failed
 
 

@@ -261,4 +261,6 @@ def choose_node(connection: Connection, node: int | None) -> int:
     if not drives:
         likely, hint = connection.explain_silence(0)
         raise BusError("no drive answers", where=str(connection.bus.channel_info), likely=likely, hint=hint)
-    raise ConfigError(f"several nodes answer: {', '.join(map(str, drives))}", hint="choose one with -n")
+    raise ConfigError(
+        f"several nodes answer: {', '.join(map(str, drives))}", hint="choose one with -n; `pmsmtool scan` lists them"
+    )

@@ -65,6 +65,7 @@ def flash_fleet(
     from pmsmtool.errors import CheckFailed, PmsmtoolError
     from pmsmtool.flash.download import Download, set_named
     from pmsmtool.flash.journal import JournalFolder
+    from pmsmtool.flash.map_gate import check_nodes
     from pmsmtool.flash.restore import marks_of, plan_download
 
     _refuse_serial(motion)
@@ -72,7 +73,9 @@ def flash_fleet(
     with set_named() as jobs, contextlib.ExitStack() as notes, bus.connect() as connection:
         for node_id in nodes:
             claim(connection, node_id)
-            node = DriveNode(connection, node_id, drive_map=drive_map)
+        found = [DriveNode(connection, node_id, drive_map=drive_map) for node_id in nodes]
+        check_nodes(drive_map, [node.identity() for node in found])
+        for node_id, node in zip(nodes, found, strict=True):
             identity = checked_identity(node, out)
             folder = JournalFolder(identity)
             if not (dry_run or check):

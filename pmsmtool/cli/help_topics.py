@@ -78,7 +78,7 @@ PMSMTOOL_JSON PMSMTOOL_VERBOSE PMSMTOOL_QUIET
                        as --json -v -q
 PMSMTOOL_HOME          folder for what must outlive a run (journals, locks, crash reports); now {home}
 CAN_INTERFACE CAN_CHANNEL CAN_BITRATE CAN_CONFIG
-                       python-can's own, with ~/.canrc, ~/.can, /etc/can.conf and can.ini; decide what is not given
+                       python-can's own, with ~/can.conf (Linux and macOS also ~/.canrc); decide what is not given
 NO_COLOR               no colours
 CC                     when installing from source: the C compiler; CC=zig takes the pinned ziglang
 

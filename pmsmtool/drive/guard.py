@@ -48,6 +48,10 @@ LOCKED_TRAVEL_RAD = math.radians(20.0)
 """A clamp and its coupling give by a few degrees; a shaft that goes further is not locked."""
 _BUG = "this is a bug worth reporting"
 _TURNS = "the shaft turns, but --shaft locked is given"
+_AS_GIVEN: Mapping[str, tuple[Callable[[float], float], str]] = {
+    "rad/s": (rpm_from_rad_s, "rpm"), "rad": (math.degrees, "deg"),
+}  # fmt: skip
+"""How a limit is given (``--speed-max``, ``--travel``), by its SI unit."""
 _NEXT_STEP = {
     "current": "raise the limit knowingly (--i-max), or ask for less",
     "d current": "state i_d_min_apk in the machine file where the magnets stand more, or ask for less",
@@ -471,11 +475,12 @@ class GuardedDrive:
 
     def _check(self, quantity: str, value: float, limit: float, unit: str) -> None:
         if not value <= limit * (1.0 + _ROUNDING):
+            as_given, shown = _AS_GIVEN.get(unit, (float, unit))
             raise LimitExceeded(
                 quantity,
-                value,
-                limit,
-                unit,
+                as_given(value),
+                as_given(limit),
+                shown,
                 where=f"node {self._node.node}",
                 likely=_TURNS if quantity == "travel" and self.envelope.shaft == "locked" else "",
                 hint=_NEXT_STEP.get(quantity, "ask for less"),

@@ -10,7 +10,7 @@ decision, not an accident.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from pmsmtool.bus.abort_codes import AbortCode
@@ -61,6 +61,23 @@ def check_map(drive_map: DriveMap, identity: Identity, folder: JournalFolder) ->
 def check_family(drive_map: DriveMap, identity: Identity) -> None:
     """Refuse a drive of another identity than its map's; raises ``ConfigError``, nothing was moved or written."""
     if not drive_map.is_for(*identity.vendor_product):
+        raise _other_drive(drive_map, identity)
+
+
+def check_nodes(drive_map: DriveMap, identities: Sequence[Identity]) -> None:
+    """Refuse nodes that are not all of the map's family; raises ``ConfigError``, nothing was moved or written."""
+    others = [identity for identity in identities if not drive_map.is_for(*identity.vendor_product)]
+    if others and len(identities) > 1 and len({identity.vendor_product for identity in identities}) > 1:
+        families = [(identity, family_of(*identity.vendor_product)) for identity in identities]
+        raise ConfigError(
+            f"these nodes are drives of several families, and a set is written through one map, here {drive_map.name}",
+            violations=[
+                f"node {identity.node}: {identity.name}, {f'map {found.name}' if found else 'no shipped map'}"
+                for identity, found in families
+            ],
+            hint="name with --nodes those of one family, and its map with --map; nothing was moved or written",
+        )
+    for identity in others:
         raise _other_drive(drive_map, identity)
 
 

@@ -136,6 +136,21 @@ def test_an_excitation_stays_within_the_envelope(drive: Shown, excitation: Excit
     assert replace(within, abort_current_apk=0.0, abort_speed_rad_s=0.0) == excitation
 
 
+@pytest.mark.parametrize(
+    ("said", "asked"),
+    [
+        ("speed 3729 rpm is outside the limit 2500 rpm", ("speed", 390.515, 261.799, "rad/s")),
+        ("travel 183.3 deg is outside the limit 180 deg", ("travel", 3.2, math.pi, "rad")),
+        ("current 5 A is outside the limit 4 A", ("current", 5.0, 4.0, "A")),
+    ],
+)
+def test_a_limit_is_told_in_the_unit_it_was_given_in(drive: Shown, said: str, asked: Any) -> None:
+    """Before, `--speed-max 2000rpm` was answered by 390.515 rad/s."""
+    with pytest.raises(LimitExceeded) as caught:
+        guard_of(drive)._check(*asked)
+    assert caught.value.what == said
+
+
 def test_an_excitation_keeps_narrower_limits_of_its_own(drive: Shown) -> None:
     asked = wave(Shape.SINE, Injection.I_D, 1.0, abort_current_apk=2.0, abort_speed_rad_s=50.0)
     recording: Any = guard_of(drive).record(["i_d_a"], 10, excitation=asked)

@@ -171,6 +171,11 @@ def test_caps_of_an_unknown_drive_says_so() -> None:
     assert outcome.exit_code == 0 and "no map names this drive" in outcome.stderr
     outcome = run("--sim", CHANNEL + "&drive=copley", "caps", "--map", "copley")
     assert "map copley (9 parameters)" in outcome.stdout
+    outcome = run("--sim", CHANNEL + "&drive=nanotec", "caps", "--map", "epos4")
+    refused = [line for line in outcome.stdout.splitlines() if "this map does not name this drive" in line]
+    assert len(refused) == 1 and "current.K_p_q_v_per_a, current.K_i_q_v_per_as" in refused[0], (
+        "16 lines of 300 letters"
+    )
 
 
 @pytest.mark.parametrize(

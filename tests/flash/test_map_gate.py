@@ -20,6 +20,7 @@ from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.map_gate import (
     check_map,
     check_motion,
+    check_nodes,
     contradictions,
     forget_map,
     memory_of,
@@ -41,6 +42,19 @@ def identity(vendor: int, product: int, *, revision: int = 0x01100000, doubt: st
 
 
 MAXON = identity(0xFB, 0x61500000)
+
+
+def test_drives_of_several_families_on_one_bus_are_named_together() -> None:
+    """Before, the first node of another family was named alone, and its map advised, which the others then lacked."""
+    reference, nanotec = identity(OURS.vendor, OURS.product), identity(0x26C, 0x10)
+    with pytest.raises(ConfigError) as caught:
+        check_nodes(OURS, [reference, MAXON, nanotec, identity(1, 2)])
+    said = str(caught.value)
+    for line in ("drive, map pmsmsim", "drive, map epos4", "drive, map nanotec", "drive, no shipped map", "--nodes"):
+        assert line in said
+    with pytest.raises(ConfigError, match="give --map epos4"):
+        check_nodes(OURS, [MAXON, MAXON])
+    check_nodes(EPOS4, [MAXON, identity(0xFB, 0x65510000)])
 
 
 @pytest.mark.parametrize(
