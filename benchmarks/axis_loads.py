@@ -2,6 +2,7 @@
 """Following error of one move with stored and with designed gains, over random loads behind an elastic shaft.
 
     python -m benchmarks.axis_loads --loads 40
+    python -m benchmarks.axis_loads --loads 10 --drive epos4
 
 The reference drive's firmware turns a motor with a load: resonance 50 to 800 Hz, load over motor inertia 0.2 to 20,
 damping 0.5 to 5 %, Coulomb friction 0.5 to 3 % of the rated torque, half of the loads with backlash of up to 0.1
@@ -9,17 +10,26 @@ degree. The design knows inertia, resonance and antiresonance as `identify` leav
 intervals. The stored gains are those of a maker's tool: crossover 60 rad/s for the whole inertia, not fed forward.
 Said are the largest following error of the designed gains over that of the stored ones, without and with ``--stored``,
 and the least margins over the tolerance box.
+
+With ``--drive FAMILY`` a simulated drive of that family does the whole job over CAN, by the commands that a person
+gives: `backup`, `tune --axis --stored`, `move`, `flash-params`, `move`. Stored are the gains of its face (crossover 60
+rad/s and 15 1/s for the whole inertia, no feed-forward). The move is of 60 degrees at half of the designed
+acceleration, at most 300 rad/s2. Said besides are how long both moves kept the drive, and why a load got no comparison.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.makers_drives import asked
 from pmsmtool.axis.design import AxisRequest
 from pmsmtool.commissioning.axis_design import design_axis
 from pmsmtool.design.design_file import Design
@@ -27,10 +37,11 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Shape
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.errors import DesignInfeasible
-from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.proof.plan import MOVE_SIGNALS, Experiment
 from pmsmtool.proof.simulated_move import hold, record_move
+from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.closed_loop import image_of
 from pmsmtool.sim.foreign.behind import stored_gains
 from pmsmtool.sim.kernel import Simulation
@@ -90,14 +101,85 @@ def error_rad(truth: MachineFile, params: ParameterSet, design: Design) -> float
     return found if math.isfinite(found) else math.inf
 
 
+SHARE_OF_ACCELERATION, FASTEST = 0.5, 300.0
+"""Acceleration of the compared move: of the designed one, and its largest (rad/s2)."""
+
+
+def compared_on(family: str, seed: int) -> tuple[float, float, float, float, str]:
+    """Return the ratio of following errors on a family's drive, margins (degree, dB), seconds of the moves, and a line.
+
+    Raises
+    ------
+    RuntimeError
+        A command ended with another exit code than 0.
+    """
+    truth, known = loaded(seed)
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        os.environ["PMSMTOOL_HOME"] = folder
+        Path("truth.toml").write_text(dump_machine_file(truth), encoding="utf-8")
+        Path("known.toml").write_text(dump_machine_file(known), encoding="utf-8")
+        drive = ("--map", family, "--sim", f"truth.toml?drive={family}&nv=drive.nv&encoder_bits={ENCODER_BITS}")
+
+        def done(*arguments: str) -> Any:
+            code, answer, reason = asked(*arguments, "--json")
+            if code:
+                raise RuntimeError(f"{arguments[0]}: exit {code}: {reason}")
+            return answer
+
+        done("backup", "-o", "stored.json", *drive)
+        made = done("tune", "known.toml", "-o", "axis.toml", "--axis", "--stored", "stored.json", "--map", family)
+        acceleration = min(FASTEST, SHARE_OF_ACCELERATION * float(made["facts"]["axis_acceleration_rad_s2"]))
+        move = ("move", "--by", "60deg", "--speed", "300rpm", "--acceleration", f"{acceleration:.4g}", *drive, "--yes")
+        before = done(*move)
+        done("flash-params", "axis.toml", *drive, "--yes")
+        after = done(*move)
+        runs = [RunDirectory(Path(one["run"])).read().stage("move") for one in (before, after)]
+    errors = [math.degrees(one["move"]["error_peak_rad"]) for one in (before, after)]
+    phase = min(float(made["facts"][f"axis_{loop}_phase_least_deg"]) for loop in ("speed", "position"))
+    peak = max(float(made["facts"][f"axis_{loop}_S_peak_db"]) for loop in ("speed", "position"))
+    seconds = sum(run.seconds for run in runs if run is not None)
+    ratio = errors[1] / errors[0]
+    line = (
+        f"{known.machine.resonance_hz:.0f} Hz, load {float(made['facts']['axis_load_ratio']):.2g}: stored "
+        f"{errors[0]:.3g} deg, with --stored x {ratio:.2f} ({phase:.0f} deg, {peak:.1f} dB, {seconds:.0f} s)"
+    )
+    return ratio, phase, peak, seconds, line
+
+
+def compare_on(family: str, first: int, loads: int) -> None:
+    """Compare moves of random loads on a family's drive; print a line for every one, and the shares."""
+    rows, ended = [], 0
+    before = Path.cwd()
+    for seed in range(first, first + loads):
+        try:
+            *numbers, line = compared_on(family, seed)
+        except RuntimeError as error:
+            ended += 1
+            line = str(error)
+        else:
+            rows.append(numbers)
+        os.chdir(before)
+        print(f"{seed}: {line}", flush=True)
+    ratios, phases, peaks, seconds = np.array(rows).T
+    print(f"following error over that of the stored gains: median {np.median(ratios):.2f}, p95 "
+          f"{np.quantile(ratios, 0.95):.2f}, largest {ratios.max():.2f}; least margin {phases.min():.1f} deg, "
+          f"largest |S| {peaks.max():.1f} dB; both moves at most {seconds.max():.0f} s; {len(rows)} of {loads} "
+          f"compared, {ended} ended before")  # fmt: skip
+
+
 def main() -> None:
     """Run the loads; print a line for every one, and the shares."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--loads", type=int, default=40)
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    asked = parser.parse_args()
+    parser.add_argument("--drive", default="", help="family of the simulated drive; default: our own core")
+    options = parser.parse_args()
+    if options.drive:
+        compare_on(options.drive, options.first, options.loads)
+        return
     plain, kept, phases, peaks, infeasible = [], [], [], [], 0
-    for seed in range(asked.first, asked.first + asked.loads):
+    for seed in range(options.first, options.first + options.loads):
         truth, known = loaded(seed)
         J = known.machine.J_kgm2 or 0.0
         gains = stored_gains(J)

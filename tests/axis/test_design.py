@@ -161,6 +161,9 @@ def test_gains_that_follow_better_are_kept() -> None:
     assert any("are kept" in note for note in made.notes)
     calm = {**stored, names[0]: 0.1 * stored[names[0]], names[1]: 0.01 * stored[names[1]], names[2]: 5.0}
     wild = {**stored, names[0]: 40.0 * stored[names[0]]}
+    unstable = design_axis(source, TuneRequest(), ASKED, own, wild)  # what it writes can be read: it held an infinity
+    assert parse_design(design_text(unstable)).facts == unstable.facts
+    assert "axis_stored_error_rad" not in unstable.facts and any("unstable" in note for note in unstable.notes)
     edge = {name: stored[name] * 1.4**power for name, power in zip(names, (1, 2, 1), strict=True)}
     plain = designed("pmsmsim", 0.0, 0.0)
     for other in (calm, wild, edge):
