@@ -158,9 +158,8 @@ def machine_of(
     found = {name: estimate for name, estimate in evaluation.estimates().items() if name not in rejected}
     values = {name: found[name].value for name in ("R_s_ohm", "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2") if name in found}
     machine = replace(nameplate.machine, **values)  # type: ignore[arg-type]
-    if evaluation.mechanics is not None:
-        B, tau_c = evaluation.mechanics.B, evaluation.mechanics.tau_c
-        machine = replace(machine, tau_c_nm=max(0.0, tau_c.value), B_nms=max(0.0, B.value))
+    friction = {name: max(0.0, found[name].value) for name in ("tau_c_nm", "B_nms") if name in found}
+    machine = replace(machine, **friction)  # type: ignore[arg-type]
     if evaluation.frequency_response is not None:
         resonant = {name: estimate.value for name, estimate in evaluation.frequency_response.found.items()}
         machine = replace(machine, **{**dict.fromkeys(RESONANCE), **resonant})  # type: ignore[arg-type]

@@ -67,7 +67,8 @@ class Evaluation:
     """What the traces of a run say; None where an experiment was not run, or is in ``refused`` with its reason.
 
     ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics``, ``frf``,
-    ``cogging`` and ``harmonics``. ``inertia`` is that by mean accelerations, where the mechanics are refused;
+    ``cogging`` and ``harmonics``. ``means`` are inertia and friction by mean accelerations, by their keys, where no
+    model explains the pushes, and ``encoder_errors`` those of the position once and twice per turn (rad);
     ``swing_hz`` is where pushes swing the shaft and no linear response does (Hz).
     ``encoder_noise_rad`` is the standard deviation of a position at rest, without what drifts (mechanical).
     ``supply_w`` is the power from which on the DC link gives way (W).
@@ -84,7 +85,8 @@ class Evaluation:
     inductance: InductanceResult | None = None
     flux: FluxResult | None = None
     mechanics: MechanicsResult | None = None
-    inertia: Estimate | None = None
+    means: Mapping[str, Estimate] = field(default_factory=dict)
+    encoder_errors: Mapping[int, float] = field(default_factory=dict)
     swing_hz: float = 0.0
     flux_map: FluxMapResult | None = None
     frequency_response: FrequencyResponse | None = None
@@ -152,8 +154,7 @@ class Evaluation:
             found["offset_rad"] = self.offset
         if self.mechanics is not None:
             found |= {"J_kgm2": self.mechanics.J, "B_nms": self.mechanics.B, "tau_c_nm": self.mechanics.tau_c}
-        if self.inertia is not None:
-            found["J_kgm2"] = self.inertia
+        found |= self.means
         if self.frequency_response is not None:
             found |= self.frequency_response.found
             if "J_kgm2" not in found and self.frequency_response.inertia is not None:
@@ -285,10 +286,11 @@ def evaluate(
     moving = shaft if pushes is None else replace(shaft, mechanics=attempt("mechanics", pushes.mechanics))
     response = attempt("frf", lambda: frequency_response.frequency_response_of(traces, moving, tolerance, dead_time_s))
     if pushes is not None and "mechanics" in refused and refused["mechanics"].reason in NOT_RIGID:
-        elastic, inertia, response = of_no_rigid_shaft(pushes, response)
+        elastic, means, response = of_no_rigid_shaft(pushes, response)
         swing_hz = 0.0 if response is not None and response.found else pushes.swing_hz(response)
-        moving = replace(moving, mechanics=elastic, inertia=inertia, swing_hz=swing_hz)
-        if elastic is not None:
+        errors = {} if elastic is not None else frequency_response.encoder_errors_of(traces, moving)
+        moving = replace(moving, mechanics=elastic, means=means, encoder_errors=errors, swing_hz=swing_hz)
+        if elastic is not None or "tau_c_nm" in means:
             del refused["mechanics"]
     elif moving.mechanics is not None:
         moving = replace(moving, mechanics=with_play_told(moving.mechanics, response))

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS, SURE
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.frequency_response import (
@@ -18,6 +19,7 @@ from pmsmtool.estimators.shaft.frequency_response import (
     FrequencyResponse,
     estimate_frequency_response,
 )
+from pmsmtool.estimators.shaft.mechanics import Torque
 from pmsmtool.estimators.shaft.response_lines import STAGE
 from pmsmtool.identification.mechanics import in_frame, torque_doubt, torque_of
 from pmsmtool.machine.torque import torque_per_ampere
@@ -56,7 +58,7 @@ def frequency_response_of(
     IdentificationError
         As the estimator refuses.
     """
-    parts = [traces[f"{TRACE}{k}"] for k in range(sum(name.startswith(TRACE) for name in traces))]
+    parts = _records(traces)
     if not parts or result.flux is None or result.encoder is None or result.offset is None:
         return None
     asked_a = float(parts[0].meta["excitation"]["amplitude"])
@@ -69,12 +71,11 @@ def frequency_response_of(
             stage=STAGE,
             likely="a light shaft with cogging, whose back-EMF moves the current, or a small motor for this drive",
         )
-    behind = result.offset.value - float(parts[0].meta["offset_rad"])
     pole_pairs = round(result.encoder.pole_pairs.value)
     known = result.mechanics
     cogging = None if known is None else partial(known.harmonics.torque_nm, J_kgm2=known.J.value)
     return estimate_frequency_response(
-        [in_frame(part, behind) for part in parts],
+        _framed(parts, result.offset.value),
         torque_of(result, pole_pairs),
         direction=int(parts[0].meta["direction"]),
         scale_std=_doubt(parts[0], result, dead_time_s),
@@ -82,6 +83,56 @@ def frequency_response_of(
         over_angle=cogging,
         tolerance=tolerance,
     )
+
+
+def _records(traces: Mapping[str, Trace]) -> list[Trace]:
+    return [traces[f"{TRACE}{k}"] for k in range(sum(name.startswith(TRACE) for name in traces))]
+
+
+def _framed(parts: Sequence[Trace], offset_rad: float) -> list[Trace]:
+    """Return records in the frame of the d axis."""
+    return [in_frame(part, offset_rad - float(part.meta["offset_rad"])) for part in parts]
+
+
+def encoder_errors_of(traces: Mapping[str, Trace], result: Evaluation) -> dict[int, float]:
+    """Return what :func:`encoder_errors` finds in the records of a run; nothing without them, or a flux linkage."""
+    parts = _records(traces)
+    if not parts or result.flux is None or result.encoder is None or result.offset is None:
+        return {}
+    torque = torque_of(result, round(result.encoder.pole_pairs.value))
+    return encoder_errors(_framed(parts, result.offset.value), torque, int(parts[0].meta["direction"]))
+
+
+def encoder_errors(parts: Sequence[Trace], torque: Torque, direction: int) -> dict[int, float]:
+    """Return what the position errs by once and twice per turn (rad), where all records show it alike.
+
+    Coasting tells it better, but a heavy shaft with friction stops before a turn. Friction over the angle looks the
+    same. Beside a random torque each record is what that moves a rigid shaft by, a speed and its change.
+
+    Parameters
+    ----------
+    parts : sequence of Trace
+        ``i_d_a i_q_a theta_M_rad`` in the frame of the d axis.
+    torque : callable
+        Torque (N m) of arrays of i_d, i_q (A).
+    direction : int
+        Sign of the encoder's count along the phase order.
+    """
+    each = []
+    for part in parts:
+        theta = direction * part["theta_M_rad"]
+        x = np.linspace(-1.0, 1.0, len(theta))
+        moved = np.cumsum(np.cumsum(torque(part["i_d_a"], part["i_q_a"])))
+        Q, _ = np.linalg.qr(np.stack([np.ones_like(x), x, x * x, moved / np.max(np.abs(moved))], axis=1))
+        waves = np.stack([of(n * theta) for n in ENCODER_ORDERS for of in (np.cos, np.sin)], axis=1)
+        each.append(np.linalg.lstsq(waves - Q @ (Q.T @ waves), theta - Q @ (Q.T @ theta), rcond=None)[0])
+    if len(each) < 2 or min(float(np.ptp(part["theta_M_rad"])) for part in parts) < 2.0 * math.pi:
+        return {}
+    mean = np.mean(each, axis=0).reshape(-1, 2)
+    std = np.std(each, axis=0, ddof=1).reshape(-1, 2) / math.sqrt(len(each))
+    sizes, deviations = np.hypot(*mean.T).tolist(), np.hypot(*std.T).tolist()
+    rows = zip(ENCODER_ORDERS, sizes, deviations, strict=True)
+    return {order: size for order, size, deviation in rows if size > SURE * deviation}
 
 
 def small_signal_doubt(sigma_a: float, displaced_a: float, deviation_a: float) -> float:

@@ -19,7 +19,7 @@ from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_instant_s
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR
-from pmsmtool.estimators.shaft.mechanics import POWERED, MechanicsResult, Torque, estimate_mechanics, mean_inertia
+from pmsmtool.estimators.shaft.mechanics import POWERED, MechanicsResult, Torque, estimate_mechanics, mean_mechanics
 from pmsmtool.estimators.shaft.swing import swing_of
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
@@ -35,7 +35,7 @@ NOT_RIGID = ("E_MODEL_MISMATCH", "E_NOT_IDENTIFIABLE", "E_NOT_CONVERGED")
 TRACE = "inertia_"
 """Followed by a number: push, coasting, push the other way, coasting."""
 ELASTIC_FALLBACK = "torque pulses on a shaft that is not rigid; J agrees with the frequency response"
-MEAN_FALLBACK = "mean acceleration of torque pulses on a shaft that is not rigid; friction is not known"
+MEAN_FALLBACK = "mean acceleration of torque pulses on a shaft that is not rigid"
 PLAY_FALLBACK = "torque pulses on a shaft with play, of which a small torque turns a part"
 PLAY_LEAST = 0.05
 """Share of the inertia that a small torque must leave unmoved before it counts as play."""
@@ -104,9 +104,9 @@ class Pushes:
         )
         return replace(found, B=replace(found.B, std=math.hypot(found.B.std, self.drag_std_nms)))
 
-    def inertia(self) -> Estimate | None:
-        """Return the inertia alone, of the mean accelerations; None where they tell none."""
-        return mean_inertia(self.parts, self.torque, self.scale_std, self.direction, self.tolerance)
+    def means(self) -> dict[str, Estimate]:
+        """Return inertia and friction of the mean accelerations, by their keys, as far as these tell them."""
+        return mean_mechanics(self.parts, self.torque, self.scale_std, self.direction, self.tolerance)
 
     def swing_hz(self, response: FrequencyResponse | None) -> float:
         """Return the frequency (Hz) at which pushes clearly swing and a response does not, else 0."""
@@ -182,8 +182,8 @@ def pushes_of(
 
 def of_no_rigid_shaft(
     pushes: Pushes, response: FrequencyResponse | None
-) -> tuple[MechanicsResult | None, Estimate | None, FrequencyResponse | None]:
-    """Return what pushes of a shaft that is not rigid tell, else its inertia, and what of the response holds.
+) -> tuple[MechanicsResult | None, dict[str, Estimate], FrequencyResponse | None]:
+    """Return what pushes of a shaft that is not rigid tell, else their means by key, and what of the response holds.
 
     A small random torque turns only what is this side of a play, pushes all of it: a response that shows less inertia
     than they do is none of the whole shaft. Where it shows more, neither is believed.
@@ -200,32 +200,37 @@ def of_no_rigid_shaft(
         slow = response.found["resonance_hz"].value
         both = f"it swings at {slow:.3g} Hz by a small torque, at {swing_hz:.3g} Hz by pulses"
         response = replace(response, found={}, inertia=None, reason=f"play, the response depends on the torque: {both}")
-        whole = pushes.inertia()
-        return None, None if whole is None else replace(whole, fallback=f"{PLAY_FALLBACK}: {both}"), response
+        return None, _because(pushes.means(), f"{PLAY_FALLBACK}: {both}"), response
     small = None if response is None else response.inertia
     found = None
     if small is not None:
         with contextlib.suppress(IdentificationError):
             found = pushes.mechanics(elastic=True)
-    whole = pushes.inertia() if found is None else found.J
+    means = pushes.means() if found is None else {"J_kgm2": found.J, "B_nms": found.B, "tau_c_nm": found.tau_c}
+    whole = means.get("J_kgm2")
     if whole is None:
-        return None, None, response
+        return None, {}, response
     why = MEAN_FALLBACK if found is None else ELASTIC_FALLBACK
     if response is not None and small is not None:
         check = cross_check("J_kgm2", "J_kgm2", small, whole)
-        if check.agrees and found is None:
-            return None, replace(whole, fallback=MEAN_FALLBACK) if whole.std < small.std else None, response
         if not check.agrees:
             both = f"{small.value:.3g} kg m2 by a small torque, {whole.value:.3g} by pulses"
             response = replace(response, found={}, inertia=None, reason=f"the shaft has play, or is not linear: {both}")
             if check.difference > 0.0:
-                return None, None, response
+                return None, {}, response
             why = f"{PLAY_FALLBACK}: {both}"
+        elif small.std < whole.std:
+            means["J_kgm2"] = small
+    if found is None and means["J_kgm2"] is small:
+        del means["J_kgm2"]  # the response says it by itself
+    means = _because(means, why)
     if found is None:
-        return None, replace(whole, fallback=why), response
-    finer = small if why == ELASTIC_FALLBACK and small is not None and small.std < found.J.std else found.J
-    J, B, tau_c = (replace(value, fallback=why) for value in (finer, found.B, found.tau_c))
-    return replace(found, J=J, B=B, tau_c=tau_c), None, response
+        return None, means, response
+    return replace(found, J=means["J_kgm2"], B=means["B_nms"], tau_c=means["tau_c_nm"]), {}, response
+
+
+def _because(means: Mapping[str, Estimate], why: str) -> dict[str, Estimate]:
+    return {key: replace(estimate, fallback=why) for key, estimate in means.items()}
 
 
 def with_play_told(found: MechanicsResult, response: FrequencyResponse | None) -> MechanicsResult:

@@ -48,7 +48,8 @@ def had_of(evaluation: Evaluation) -> list[str]:
     """Return the evaluations that gave a result, by the keys of ``Evaluation.refused``."""
     results = {
         "R": evaluation.resistance, "encoder": evaluation.encoder, "L": evaluation.inductance, "psi": evaluation.flux,
-        "map": evaluation.flux_map, "mechanics": evaluation.mechanics, "frf": evaluation.frequency_response,
+        "map": evaluation.flux_map, "mechanics": evaluation.mechanics or evaluation.means.get("tau_c_nm"),
+        "frf": evaluation.frequency_response,
         "cogging": evaluation.cogging, "harmonics": evaluation.harmonics,
     }  # fmt: skip
     return [name for name, result in results.items() if result is not None]
@@ -153,12 +154,13 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions[frequency_response.SHOWN] = frequency_response.shown_of(evaluation.frequency_response)
     if evaluation.swing_hz:
         conditions[SWING] = evaluation.swing_hz
+    errors_rad = dict(evaluation.encoder_errors)
     if evaluation.mechanics is not None:
         if evaluation.mechanics.drag is not None:
             conditions["drag_nms2"] = evaluation.mechanics.drag.value
-        often = dict(zip(ENCODER_ORDERS, ("once", "twice"), strict=True))
-        for h in evaluation.mechanics.harmonics.encoder_rad:
-            conditions[f"encoder_{often[h.order]}_rad"] = h.amplitude
+        errors_rad |= {h.order: h.amplitude for h in evaluation.mechanics.harmonics.encoder_rad}
+    often = dict(zip(ENCODER_ORDERS, ("once", "twice"), strict=True))
+    conditions |= {f"encoder_{often[order]}_rad": error_rad for order, error_rad in errors_rad.items()}
     if evaluation.cogging is not None and evaluation.cogging.harmonics.acceleration_rad_s2:
         largest = max(evaluation.cogging.harmonics.acceleration_rad_s2, key=lambda h: h.amplitude)
         conditions |= {"cogging_nm": evaluation.cogging.J.value * largest.amplitude, "cogging_periods": largest.order}

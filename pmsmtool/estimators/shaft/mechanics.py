@@ -88,6 +88,7 @@ SCALE_FLOOR = 3e-4
 NO_HARMONICS = AngleHarmonics()
 MEAN_STD = 0.04
 """Relative standard deviation of the inertia by mean accelerations: six shafts with play were 0.1 to 1.6 % off."""
+MEANS = {"J_kgm2": "kg m2", "B_nms": "N m s", "tau_c_nm": "N m"}
 MEAN_METHOD = "mean torque and acceleration of torque pulses and coasting"
 METHOD = "torque pulses and coasting, output error on position, whitened"
 
@@ -264,39 +265,38 @@ def estimate_mechanics(
     return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, unexplained, harmonics, drag)
 
 
-def mean_inertia(
-    runs: Sequence[Trace],
-    torque: Torque,
-    scale_std: float,
-    direction: int,
-    tolerance: SensorTolerance | None = None,
-) -> Estimate | None:
-    """Return the inertia alone, from a regression of the mean torques on the mean motions of half traces.
+def mean_mechanics(
+    runs: Sequence[Trace], torque: Torque, scale_std: float, direction: int, tolerance: SensorTolerance | None = None
+) -> dict[str, Estimate]:
+    """Return inertia and friction by their keys, from a regression of the mean torques on the mean motions of halves.
 
-    Whatever swings or strikes within them is in neither mean. Parameters as of :func:`estimate_mechanics`; None where
-    it finds no inertia.
+    Whatever swings or strikes within half a trace is in neither mean. Parameters as of :func:`estimate_mechanics`;
+    nothing where it finds no inertia, and no friction that may be more than what turned the shaft.
     """
     runs = [_fast(_fast(_window(run))) for run in runs]  # the second time without a long rest
     step = encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, 0.0, 0.0, direction, step, NO_HARMONICS, 0.0)[1] for run in runs]
-    found, J_std, _ = _mean_motion(blocks)
-    J = float(found[0])
-    if not J > 0.0:
-        return None
-    std = math.hypot(J_std, J * math.hypot(MEAN_STD, scale_std))
-    return Estimate(J, std, (tolerance or SensorTolerance()).inertia * J, "kg m2", n=len(runs), method=MEAN_METHOD)
+    values, stds, _ = _mean_motion(blocks)
+    if not values[0] > 0.0:
+        return {}
+    if _doubt(blocks, *stds[1:]) > largest_torque(blocks):
+        values = values[:1]
+    scale, systematic = math.hypot(MEAN_STD, scale_std), (tolerance or SensorTolerance()).inertia
+    return {
+        key: Estimate(v, math.hypot(std, scale * v), systematic * abs(v), unit, n=len(runs), method=MEAN_METHOD)
+        for v, std, (key, unit) in zip(values.tolist(), stds, MEANS.items(), strict=False)
+    }
 
 
 def require_useful(runs: Sequence[Run], B_std: float, tau_std: float) -> None:
     """Refuse friction that may be more than what turned the shaft: a fit that ran away, and J with it."""
-    doubt, largest = COVERAGE_FACTOR * max(B_std * fastest(runs), tau_std), largest_torque(runs)
-    if doubt > largest:
-        raise refuse(
-            "E_NOT_IDENTIFIABLE",
-            f"friction is known to +-{doubt:.2g} N m, the pulses made {largest:.2g} N m",
-            stage=STAGE,
-            likely=NOISY_TORQUE,
-        )
+    if (doubt := _doubt(runs, B_std, tau_std)) > (largest := largest_torque(runs)):
+        raise refuse("E_NOT_IDENTIFIABLE", f"friction is known to +-{doubt:.2g} N m, the pulses made {largest:.2g} N m",
+                     stage=STAGE, likely=NOISY_TORQUE)  # fmt: skip
+
+
+def _doubt(runs: Sequence[Run], B_std: float, tau_std: float) -> float:
+    return COVERAGE_FACTOR * max(B_std * fastest(runs), tau_std)
 
 
 Fitted = tuple[Sequence[Run], Fit, float, Sequence[Run]]
@@ -396,8 +396,8 @@ def _start(runs: Sequence[Run]) -> Array:
     return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
 
 
-def _mean_motion(runs: Sequence[Run]) -> tuple[Array, float, list[float]]:
-    """Return J, B, tau_c of the mean torques and motions of half traces, the deviation of J, and the first states."""
+def _mean_motion(runs: Sequence[Run]) -> tuple[Array, list[float], list[float]]:
+    """Return J, B, tau_c of the mean torques and motions of half traces, their deviations, and the first states."""
     rows, torques, states = [], [], []
     for run in runs:
         t = run.T * np.arange(len(run.theta))
@@ -409,8 +409,9 @@ def _mean_motion(runs: Sequence[Run]) -> tuple[Array, float, list[float]]:
             torques.append(float(np.mean(run.torque[part])))
         first = np.polyfit(t[: len(t) // 4], run.theta[: len(t) // 4], 2)
         states += [run.theta[0], float(first[1])]
-    x, covariance, residual, _ = linear_solve(np.array(rows), np.array(torques), np.ones(len(rows)))
-    return x, math.sqrt(float(covariance[0, 0] * (residual @ residual)) / (len(rows) - len(x))), states
+    change = np.abs(np.array(rows)[:, 0])  # in proportion to its error: pushes tell J, coasting tells the friction
+    x, covariance, residual, _ = linear_solve(np.array(rows), np.array(torques), 1.0 / (change + 1e-3 * max(change)))
+    return x, np.sqrt(np.diag(covariance) * (residual @ residual) / (len(rows) - len(x))).tolist(), states
 
 
 def _fit(runs: Sequence[Run], start: Array, elastic: bool) -> tuple[Fit, float, Sequence[Run]]:
