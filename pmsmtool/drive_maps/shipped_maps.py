@@ -31,7 +31,7 @@ def load_family(name: str) -> DriveMap:
         There is no such family.
     """
     if name not in family_names():
-        near = get_close_matches(name, family_names(), 1)
+        near = get_close_matches(name.lower(), family_names(), 1)
         raise ConfigError(
             f"no drive family {name!r}" + (f", did you mean {near[0]}?" if near else ""),
             hint=f"one of {', '.join(family_names())}, or the path of a map file",

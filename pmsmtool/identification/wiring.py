@@ -191,6 +191,10 @@ def judge_current(turn: Trace, i_a: float) -> list[Finding]:
     return [Finding("phases", WRONG, seen, OPEN_BY)]
 
 
+NOT_BACK_BY = "a motor lead that is not connected; a load that turns the shaft; the encoder's sign or offset"
+"""An open phase turns the rotor towards one angle, whatever the sign of the torque that is asked for."""
+
+
 def judge_push(pushes: Trace) -> list[Finding]:
     """Judge two torque pushes, forth and back, of a drive that commutates by itself.
 
@@ -214,8 +218,8 @@ def judge_push(pushes: Trace) -> list[Finding]:
     if not np.any(way):
         return [*found, Finding("shaft", NOT_SEEN, "what is wrong comes first")]
     if way[0] * way[1] >= 0.0:
-        seen = f"torque forth and back moves the shaft by {ways}, both the same way"
-        return [*found, Finding("shaft", WRONG, seen, "a load that turns the shaft; the encoder's sign or offset")]
+        how = "both the same way" if np.all(way) else "one way alone"
+        return [*found, Finding("shaft", WRONG, f"torque forth and back moves the shaft by {ways}, {how}", NOT_BACK_BY)]
     found.append(Finding("shaft", OK, f"torque forth and back moves it by {ways}"))
     if way[0] * command[0] < 0.0:
         return [*found, Finding("encoder sign", WRONG, FALLS, POLARITY_BY)]

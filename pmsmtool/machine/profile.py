@@ -42,7 +42,7 @@ def machine_path(source: str | Path) -> Path:
         )
     from difflib import get_close_matches
 
-    near = get_close_matches(str(source), profile_names(), 3)
+    near = get_close_matches(str(source).lower(), profile_names(), 3)
     raise ConfigError(
         f"no profile and no file is named {str(source)!r}",
         likely=f"did you mean {' or '.join(near)}?" if near else near_names(path),

@@ -85,6 +85,14 @@ def test_pushes_are_judged_by_current_way_and_sign() -> None:
     assert pushed((0.71, -0.71), (0.3, -0.2))["shaft"] == "ok", "a reading as peak of what is rms"
 
 
+@pytest.mark.parametrize(("way_rad", "how"), [((0.13, 0.0), "one way alone"), ((0.3, 0.2), "both the same way")])
+def test_a_shaft_that_does_not_come_back_names_an_open_phase(way_rad: tuple[float, float], how: str) -> None:
+    """Before, a simulated EPOS4 with an open phase a was blamed on its load or its encoder."""
+    signals = {"i_command_a": np.array([1.0, -1.0]), "i_q_a": np.array([0.9, -0.9]), "way_rad": np.array(way_rad)}
+    (found,) = judge_push(Trace(np.array([0.0, 1.0]), signals, dict.fromkeys(signals, ""), {}))
+    assert found.likely.startswith("a motor lead that is not connected;") and found.shown.endswith(how)
+
+
 @pytest.mark.parametrize(
     ("shares", "way", "kept"),
     [

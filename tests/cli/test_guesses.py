@@ -26,6 +26,8 @@ TERMINAL = 80
         ("caps --sim interor-2k2", "interior-2k2"),
         ("caps --map epos5 -i pmsmsim", "epos4"),
         ("commission interior-2k2 --rehearse nanotek --yes", "nanotec"),
+        ("commission interior-2k2 --rehearse EPOS4 --yes", "epos4"),
+        ("tune INTERIOR-2K2 -o d.toml", "interior-2k2"),
         ("scan -i soketcan -c can0", "socketcan"),
         ("param help current.K_p", "current.K_p_d_v_per_a"),
         ("param help motor.R_s", "motor.R_s_ohm"),
