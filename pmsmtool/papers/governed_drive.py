@@ -22,7 +22,7 @@ from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.sim.kernel import Application, Rotor, Setup, Simulation, Target
+from pmsmtool.sim.kernel import Application, Part, Rotor, Setup, Simulation, Target
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import RPM, build_setup, with_simulation
@@ -118,6 +118,8 @@ class Condition:
         Noisy, quantised current samples.
     R, L, psi : float
         Plant over controller.
+    whole : bool
+        The drive's whole firmware on the profile's own inverter, sensors and encoder, instead of ideal ones.
     """
 
     name: str = "nominal"
@@ -126,6 +128,7 @@ class Condition:
     R: float = 1.0
     L: float = 1.0
     psi: float = 1.0
+    whole: bool = False
 
 
 NOMINAL = Condition()
@@ -193,7 +196,8 @@ def machine_with(condition: Condition) -> MachineFile:
         noise = {"sensor_noise_apk": NOISE_APK, "adc_bits": bits, "adc_full_scale_apk": ADC_LSB_APK * 2 ** (bits - 1)}
     file = source()
     file = replace(file, inverter=replace(file.inverter, delay_periods=1.5 if condition.delayed else 0.5))
-    return with_simulation(file, {**IDEAL, **truth, **noise})
+    taken: dict[str, Value] = {"rotor": "driven"} if condition.whole else IDEAL
+    return with_simulation(file, {**taken, **truth, **noise})
 
 
 @cache
@@ -285,7 +289,8 @@ class GovernedDrive:
         self.law, self.condition, self.seed = law, condition, seed
         file = machine_with(condition)
         self._setup: Setup
-        self._setup, self._keep = build_setup(file, seed=seed, application=Application.CORE)
+        application = Application.DRIVE if condition.whole else Application.CORE
+        self._setup, self._keep = build_setup(file, seed=seed, application=application)
         self._setup.machine.rotor = Rotor.DRIVEN
         self._image = pack_image(law_values(law, condition.delayed) if values is None else dict(values))
         self.plant = plant_of(condition)
@@ -302,9 +307,9 @@ class GovernedDrive:
         simulation = self._simulation(rpm[0][1])
         for axis, (a, b) in zip((Target.I_D, Target.I_Q), zip(start, target, strict=True), strict=True):
             simulation.schedule(axis, (0.0, t0, t0), (a, a, b))
-        t_udc = BOOST_S
-        nominal = source().inverter.U_dc_v
-        simulation.schedule(Target.U_DC, (0.0, t_udc, t_udc), (BOOST_V, BOOST_V, nominal))
+        if not self.condition.whole:  # which would trip on it, and starts without current
+            nominal = source().inverter.U_dc_v
+            simulation.schedule(Target.U_DC, (0.0, BOOST_S, BOOST_S), (BOOST_V, BOOST_V, nominal))
         simulation.reference.mode = MODES["current"]
         return self._record(simulation, rpm, t0, duration_s)
 
@@ -324,7 +329,9 @@ class GovernedDrive:
         self._setup.omega_M = RPM * rpm
         self._setup.seed = self.seed
         self.seed += 1
-        return Simulation(self._setup, self._image, self._keep)
+        simulation = Simulation(self._setup, self._image, self._keep)
+        simulation.word(Part.ENABLED).value = 1
+        return simulation
 
     def _record(
         self, simulation: Simulation, rpm: Sequence[tuple[float, float]], t0: float, duration_s: float

@@ -48,6 +48,7 @@ FIGURES: tuple[Row, ...] = (
     Row("jercic-fig10", "current_step:q_steps", "step of i_q by seven laws, against minimum time", JERCIC, 5.0),
     Row("jercic-fig11", "weakening:figure_11", "field weakening on perturbed plants, over time", JERCIC, 1.0),
     Row("jercic-fig12", "weakening:figure_12", "field-weakening sweep; excess voltage on faster ramps", JERCIC, 1.0),
+    Row("jercic-experiments", "experiments:experiments", "figures 10 (b), 12 (b): the whole drive, noise", JERCIC, 2.0),
     Row("jercic-table2", "weakening:table_2", "voltage and torque error on perturbed plants", JERCIC, 1.0),
     Row("jercic-horizon", "horizon:horizons", "k_max over tuning, tightening, speed, bounds; matrices", JERCIC, 3.0),
     Row("governor-random-steps", "random_steps:random_steps", "300 reachable steps over minimum time", JERCIC, 5.0),

@@ -228,6 +228,8 @@ def _notes() -> tuple[str, ...]:
 
 # -- figure 12 -----------------------------------------------------------------------------------------------------
 
+SWEEP_S = ((0.0, FROM_RPM), (0.1, FROM_RPM), (0.7, 800.0), (0.9, 800.0), (1.5, FROM_RPM), (1.6, FROM_RPM))
+"""Speed (rpm) over time (s): into field weakening and back."""
 SLOPES_RPM_S = (667.0, 3000.0, 6000.0, 12000.0)
 """Speed slopes of the sweep from 600 to 800 rpm."""
 SLOPE_ROOM = 0.1
@@ -237,8 +239,7 @@ SLOPE_ROOM = 0.1
 def figure_12(seed: int) -> Reproduction:
     """Return a sweep into field weakening and back, and the excess voltage on faster ramps against its prediction."""
     del seed
-    nodes = ((0.0, FROM_RPM), (0.1, FROM_RPM), (0.7, 800.0), (0.9, 800.0), (1.5, FROM_RPM), (1.6, FROM_RPM))
-    runs = [sweep(law, NOMINAL, nodes, 1.6) for law in (COMPENSATED, ACCELERATED)]
+    runs = [sweep(law, NOMINAL, SWEEP_S, SWEEP_S[-1][0]) for law in (COMPENSATED, ACCELERATED)]
     rows, checks = [], []
     for run in runs:
         begin = round(BEGIN_S / run.response.T_s)

@@ -11,6 +11,7 @@ import pytest
 
 from pmsmtool.papers.current_step import q_steps
 from pmsmtool.papers.delay import delay_and_predictor
+from pmsmtool.papers.experiments import experiments
 from pmsmtool.papers.figure import Reproduction
 from pmsmtool.papers.horizon import horizons
 from pmsmtool.papers.random_steps import (
@@ -31,6 +32,7 @@ MADE: dict[str, Callable[[], Reproduction]] = {
     "jercic-fig10": lambda: q_steps(1),
     "jercic-fig11": lambda: figure_11(1),
     "jercic-fig12": lambda: figure_12(1),
+    "jercic-experiments": lambda: experiments(1),
     "jercic-table2": lambda: table_2(1),
     "jercic-horizon": lambda: horizons(1),
     "governor-random-steps": lambda: random_steps(1, CASES),
@@ -83,6 +85,13 @@ def test_q_step_times_of_the_reference() -> None:
         2.82, abs=0.01
     )
     assert cells(found, "settling 2 %", law="linearised", condition="nominal", speed=620.0)[0] > 15.0
+
+
+def test_on_the_whole_drive_a_governor_alone_keeps_the_demand() -> None:
+    found = made("jercic-experiments")
+    assert min(cells(found, "demand/V_max", law="back")) > 2.0
+    slow = cells(found, "settling 5 %", law="paper", speed=620.0)
+    assert slow == pytest.approx(cells(found, "settling 5 %", law="back", speed=620.0), rel=0.1)
 
 
 def test_nobody_settles_before_the_least_time() -> None:
