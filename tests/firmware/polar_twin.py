@@ -261,7 +261,20 @@ class PolarTwin(Twin):
             K[1] * (b * r[1] - i[1]) + (model[1] - self.R * i[1]),
         )
 
+    def integrate(self) -> None:
+        x = [*self.charge]
+        for k, axis in enumerate("dq"):
+            K_i = self.cdm(self["polar.tau_s"], self[f"motor.L_{axis}_h"])[1]
+            x[k] = x[k] + K_i * self.T_s * (self.reference[k] - self.i[k])
+        self.charge = x[0], x[1]
+
+    @property
+    def ahead(self) -> bool:
+        return bool(self.options & PREDICT and self["inverter.delay_periods"] >= 1)
+
     def regularised(self) -> None:
+        if self.ahead:
+            self.integrate()
         base = self.regularised_base()
         self.polar_map((base[0] + self.charge[0], base[1] + self.charge[1]))
 
@@ -270,8 +283,10 @@ class PolarTwin(Twin):
         for k, axis in enumerate("dq"):
             K_p, K_i = self.cdm(self["polar.tau_s"], self[f"motor.L_{axis}_h"])
             cut = realised[k] - (base[k] + x[k])
-            x[k] = x[k] + K_i * self.T_s * ((self.reference[k] - self.i[k]) + cut / K_p)
+            x[k] = x[k] + K_i * self.T_s * (cut / K_p)
         self.charge = x[0], x[1]
+        if not self.ahead:
+            self.integrate()
 
     def holding(self, i: Vector) -> Vector:
         v = self.model_voltage(i)
@@ -447,8 +462,7 @@ class PolarTwin(Twin):
         self.reference = self.limit_current(request)
         self.V_max = self["inverter.voltage_utilisation"] * U_dc
         self.V = self["polar.V_a_max_ratio"] * self.V_max
-        ahead = self.options & PREDICT and self["inverter.delay_periods"] >= 1
-        self.i_model = self.predict(s, c) if ahead else self.i
+        self.i_model = self.predict(s, c) if self.ahead else self.i
         stands_in = self.demand_polar(s, c)
         realised = self.limit_voltage(self.u, self.V)
         stator = park_inverse(realised, s_out, c_out)

@@ -147,10 +147,27 @@ static pmsm_dq regularised_base(const pmsm_period *period, const axis_gains *gai
     return v;
 }
 
+/* With prediction the voltage acts one period later, when the integrators of a law without delay have seen this sample:
+ * they take it before the law asks, not after. */
+static uint32_t looks_ahead(const pmsm_params *params)
+{
+    return ((params->polar_options & PMSM_POLAR_PREDICT) != 0u && params->inverter_delay_periods >= 1.0F) ? 1u : 0u;
+}
+
+static void integrate(pmsm_period *period, const axis_gains *gains, pmsm_real T_s)
+{
+    pmsm_dq *integrator = &period->state->polar.integrator;
+    integrator->d += gains->d.K_i * T_s * (period->reference.d - period->i.d);
+    integrator->q += gains->q.K_i * T_s * (period->reference.q - period->i.q);
+}
+
 static void regularised(pmsm_period *period, const polar_plant *p)
 {
     pmsm_polar_state *memory = &period->state->polar;
     const axis_gains gains = regularised_gains(period);
+    if (looks_ahead(period->params) != 0u) {
+        integrate(period, &gains, p->T_s);
+    }
     const pmsm_dq base = regularised_base(period, &gains);
     const pmsm_dq v = {base.d + memory->integrator.d, base.q + memory->integrator.q};
     pmsm_polar_map(period, v, (pmsm_real)period->params->polar_eps_ratio * p->V);
@@ -164,11 +181,13 @@ static void regularised_settle(pmsm_period *period, pmsm_real T_s)
     const pmsm_dq base = regularised_base(period, &gains);
     const pmsm_dq cut = {period->u_realised.d - (base.d + memory->integrator.d),
                          period->u_realised.q - (base.q + memory->integrator.q)};
-    const pmsm_dq e = {period->reference.d - period->i.d, period->reference.q - period->i.q};
     const pmsm_real back_d = (gains.d.K_p > PMSM_C(0.0)) ? cut.d / gains.d.K_p : PMSM_C(0.0);
     const pmsm_real back_q = (gains.q.K_p > PMSM_C(0.0)) ? cut.q / gains.q.K_p : PMSM_C(0.0);
-    memory->integrator.d += gains.d.K_i * T_s * (e.d + back_d);
-    memory->integrator.q += gains.q.K_i * T_s * (e.q + back_q);
+    memory->integrator.d += gains.d.K_i * T_s * back_d;
+    memory->integrator.q += gains.q.K_i * T_s * back_q;
+    if (looks_ahead(period->params) == 0u) {
+        integrate(period, &gains, T_s);
+    }
 }
 
 /* --- selection --------------------------------------------------------------------------------------------------- */
@@ -257,7 +276,7 @@ void pmsm_polar_demand(pmsm_period *period)
     if (!(p.V > PMSM_C(0.0))) {
         return; /* no link voltage: no phase to speak of */
     }
-    if ((period->params->polar_options & PMSM_POLAR_PREDICT) != 0u && period->params->inverter_delay_periods >= 1.0F) {
+    if (looks_ahead(period->params) != 0u) {
         period->i_model = pmsm_predict_current(period);
     }
     if (period->state->polar.started == 0u) {
