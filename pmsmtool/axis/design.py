@@ -20,6 +20,7 @@ from pmsmtool.design.ratings import ratings_of
 from pmsmtool.design.tolerance import NORMAL_95, tolerance_box
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.machine.two_masses import Mechanics, mechanics_of
 from pmsmtool.params.catalogue import INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
@@ -168,6 +169,11 @@ class AxisDesign:
         return _judged(self.design, values, self.box, speed, position)
 
 
+def assumed_torque(machine: MachineParameters) -> float:
+    """Return the torque of an ampere of unknown kind (N m/A): the middle of peak and rms."""
+    return MIDDLE_KIND * torque_per_ampere(machine.pole_pairs, machine.psi_f_wb)
+
+
 def from_pid(K_P: float, K_I: float, K_D: float, like: AxisGains) -> AxisGains:
     """Return the cascade of a PID: K_v is the root of K_D K_v^2 - K_P K_v + K_I that is nearer to another's."""
     apart = math.sqrt(max(K_P * K_P - 4.0 * K_D * K_I, 0.0))
@@ -190,9 +196,11 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     design, box = made.design, made.box
     speed, position = _stored_gains(stored, made, drive)
     if speed is None or position is None:
-        note = "no comparison with the stored gains: those of one loop are missing or zero"
+        note = "no comparison with the stored gains: those of a loop are missing or zero"
         return replace(made, design=replace(design, notes=(*design.notes, note)))
-    judged = (box.judged(speed, "speed"), box.judged(position, "position"))
+    judged = [box.judged(position, "position")]
+    if not drive.pid:  # one controller of the position moves alone: the controller of the speed stays as designed
+        judged.append(box.judged(speed, "speed"))
     phase, peak = min(found.phase_deg for found in judged), max(found.S_db for found in judged)
     stable = math.isfinite(phase)
     J, friction = box.path.shaft.J, design.machine.machine.tau_c_nm or 0.0
@@ -236,7 +244,8 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
 
 
 def _gain_rows(drive: AxisDrive) -> tuple[str, ...]:
-    return (*SPEED, *(PID[:3] if drive.pid else CASCADE[:1]))
+    """Return the gains that decide how a move is followed."""
+    return PID[:3] if drive.pid else (*SPEED, *CASCADE[:1])
 
 
 def _stored_gains(
@@ -246,10 +255,11 @@ def _stored_gains(
     if not all(stored.get(name, 0.0) > 0.0 for name in _gain_rows(drive)):
         return None, None
     notch = Notch(stored.get(NOTCH[0], 0.0), *(stored.get(name, 1.0) for name in NOTCH[1:]))
-    speed = AxisGains(stored[SPEED[0]], stored[SPEED[1]], stored.get(CASCADE[0], made.speed.K_v), notch)
-    if not drive.pid:
-        return speed, speed
-    return speed, replace(from_pid(stored[PID[0]], stored[PID[1]], stored[PID[2]], made.position), notch=notch)
+    if drive.pid:
+        position = from_pid(stored[PID[0]], stored[PID[1]], stored[PID[2]], made.position)
+        return made.speed, replace(position, notch=notch)
+    speed = AxisGains(stored[SPEED[0]], stored[SPEED[1]], stored[CASCADE[0]], notch)
+    return speed, speed
 
 
 def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDesign:
@@ -455,7 +465,7 @@ def axis_values(
     told = (*SPEED, *NOTCH, *(() if drive.pid else CASCADE))  # without an object, too: a person enters them
     values = {name: value for name, value in found.items() if name in drive.offers or name in told}
     if drive.amperes:
-        K_t = MIDDLE_KIND * torque_per_ampere(machine.pole_pairs, machine.psi_f_wb)
+        K_t = assumed_torque(machine)
         how = "1.5 p psi_f per ampere, between peak and rms: compared, never written"
         values[TORQUE_PER_AMPERE] = DesignValue(K_t, how)
     if INCREMENTS in drive.offers:

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from pmsmtool.run_directory import RunDirectory
     from pmsmtool.trace import Trace
 
-TRAVEL_MARGIN, SPEED_MARGIN = 1.25, 1.5
-"""Limits over what is asked for: an overshoot by a badly damped loop is seen, and more ends the move."""
+TRAVEL_MARGIN, SPEED_MARGIN = 1.5, 1.5
+"""Limits over what is asked for: more ends the move. Calm gains of makers' tools go 30 % beyond a way of 60 degrees."""
 ERROR_SHARE = 0.5
 """Following error at which the voltage is removed, of the way."""
 DURATION_S = 45.0

@@ -3,14 +3,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
-from pmsmtool.axis.design import AXIS_ROWS, CASCADE, PID, SPEED, AxisDrive, AxisRequest, at_least_as_good, with_axis
+from pmsmtool.axis.design import (
+    AXIS_ROWS,
+    CASCADE,
+    PID,
+    SPEED,
+    SPEED_FORWARD,
+    AxisDrive,
+    AxisRequest,
+    assumed_torque,
+    at_least_as_good,
+    with_axis,
+)
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
-from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.drive_map import Cell, DriveMap
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import TORQUE_PER_AMPERE
 from pmsmtool.params.parameter_set import ParameterSet
@@ -24,6 +36,14 @@ def axis_drive(drive_map: DriveMap) -> AxisDrive:
         period.number if period is not None and period.number else None,
         any(cell.form == "current" for cell in drive_map.cells.values()), TORQUE_PER_AMPERE in drive_map.cells,
     )  # fmt: skip
+
+
+def own_torque(source: MachineFile, drive_map: DriveMap) -> dict[str, float]:
+    """Return what gains in amperes are counted by on a drive that does not hold the torque of an ampere itself."""
+    drive = axis_drive(drive_map)
+    if not drive.amperes or drive.holds_torque:
+        return {}
+    return {TORQUE_PER_AMPERE: assumed_torque(source.machine)}
 
 
 def design_axis(
@@ -54,16 +74,41 @@ def design_axis(
     fitting = dict(wanted.values)
     for group in GROUPS:
         fitting |= _slowed(drive_map, group, wanted)
-    cut = [name for name, value in fitting.items() if value < wanted.values[name]]
-    held = drive_map.quantised(replace(wanted, values=fitting)).values
+    less = _cut(drive_map, wanted)
+    slower = [name for name, value in fitting.items() if value < wanted.values[name]]
+    held = drive_map.quantised(replace(wanted, values=fitting | less)).values
     design = made.with_held({name: value for name, value in held.items() if drive_map.writes(name, wanted.values)})
-    notes += tuple(f"{name}: {wanted.values[name]:.4g} is designed, slower by what its objects hold" for name in cut)
+    notes += tuple(f"{name}: {wanted.values[name]:.4g} is designed, slower by what its objects hold" for name in slower)
+    notes += tuple(f"{name}: {wanted.values[name]:.4g} is designed, its object holds no more" for name in less)
+    if CASCADE[2] in less:  # the errors were predicted with all of it
+        kept = {name: fact for name, fact in design.facts.items() if name not in PREDICTED}
+        design = replace(design, facts=kept)
     return replace(design, notes=(*design.notes, *notes))
 
 
 GROUPS = ({SPEED[0]: 1, SPEED[1]: 2}, {PID[0]: 2, PID[1]: 3, PID[2]: 1})
 """Gains of one controller, and the power of its crossover with which each grows."""
 SIGNED = ("INTEGER8", "INTEGER16", "INTEGER32")
+
+
+PREDICTED = ("axis_inertia_ff_share", "axis_following_error_rad", "axis_error_rad")
+
+
+def _largest(cell: Cell) -> float:
+    """Return the largest count of an object."""
+    return math.inf if cell.wire == "REAL32" else 2.0 ** (8 * cell.size - (cell.wire in SIGNED)) - 1.0
+
+
+def _cut(drive_map: DriveMap, wanted: ParameterSet) -> dict[str, float]:
+    """Return the feed-forwards that are beyond what their objects hold, as much as these do."""
+    found = {}
+    for name in (*SPEED_FORWARD, *CASCADE[1:], *PID[3:]):
+        if name in drive_map.cells and name in wanted.values and drive_map.writes(name, wanted.values):
+            cell = drive_map.cells[name]
+            counts = cell.counts(wanted.values[name], wanted.values)
+            if counts > _largest(cell):
+                found[name] = wanted.values[name] * _largest(cell) / counts
+    return found
 
 
 def _slowed(drive_map: DriveMap, group: dict[str, int], wanted: ParameterSet) -> dict[str, float]:
@@ -75,9 +120,8 @@ def _slowed(drive_map: DriveMap, group: dict[str, int], wanted: ParameterSet) ->
     ]
     share = 1.0
     for cell, power in rows:
-        if cell.wire != "REAL32":
-            largest = 2.0 ** (8 * cell.size - (cell.wire in SIGNED)) - 1.0
-            share = min(share, (largest / cell.counts(wanted.values[cell.name], wanted.values)) ** (1.0 / power))
+        counts = cell.counts(wanted.values[cell.name], wanted.values)
+        share = min(share, (_largest(cell) / counts) ** (1.0 / power) if counts else 1.0)
     return {cell.name: wanted.values[cell.name] * share**power for cell, power in rows}
 
 

@@ -106,10 +106,12 @@ def take_backup(node: DriveNode, identity: Identity, *, progress: Progress = lam
     )
 
 
-def snapshot_set(drive_map: DriveMap, entries: list[Entry] | tuple[Entry, ...]) -> ParameterSet:
-    """Return the old contents of a snapshot as a parameter set."""
+def snapshot_set(
+    drive_map: DriveMap, entries: list[Entry] | tuple[Entry, ...], given: Mapping[str, float] | None = None
+) -> ParameterSet:
+    """Return the old contents of a snapshot as a parameter set; ``given`` as of ``DriveMap.decode``."""
     known = {e.name: e.old for e in entries if e.name in drive_map.cells or e.name in drive_map.tables}
-    return drive_map.decode(known)
+    return drive_map.decode(known, given)
 
 
 def old_marks(snapshot: Snapshot) -> dict[str, bytes]:

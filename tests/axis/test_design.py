@@ -14,17 +14,20 @@ from pmsmtool.axis.design import PID, AxisGains, AxisRequest, axis_path, from_pi
 from pmsmtool.axis.loops import lifted
 from pmsmtool.axis.robustness import axis_margins
 from pmsmtool.axis.search import Box, Limits, stiffest
-from pmsmtool.commissioning.axis_design import axis_drive, axis_parameters, design_axis, not_offered
+from pmsmtool.commissioning.axis_design import axis_drive, axis_parameters, design_axis, not_offered, own_torque
 from pmsmtool.design.design_file import Design, design_text, parse_design
 from pmsmtool.design.loops.speed_loop import Notch
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, DesignInfeasible
+from pmsmtool.flash.journal import Entry
 from pmsmtool.flash.plan import make_plan, names_to_read
+from pmsmtool.flash.restore import snapshot_set
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.two_masses import mechanics_of
 from pmsmtool.params.catalogue import INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
+from pmsmtool.params.parameter_set import ParameterSet
 
 ASKED = AxisRequest()
 SLACK_DEG, SLACK_DB = 0.3, 0.1
@@ -199,3 +202,33 @@ def test_gains_without_an_object_are_those_of_the_axis() -> None:
     assert rows.values["position.inertia_ff_kgm2"] == pytest.approx(share * J, rel=1e-12)
     assert "stiffest" in rows.provenance["position.K_p_per_s"]
     assert "position.K_p_per_s" not in axis_parameters(designed("epos4", 0.0, 0.0)).values  # one PID of the position
+
+
+def test_a_feed_forward_beyond_its_object_is_cut_and_said() -> None:
+    """EPOS2 keeps it as UNSIGNED16 of uA s2/rad: 0.19 kg m2 with the torque of this motor. It was exit code 2."""
+    source = machine()
+    heavy = replace(source, machine=replace(source.machine, J_kgm2=0.3), std={**source.std, "J_kgm2": 0.005})
+    made = design_axis(heavy, TuneRequest(), ASKED, load_family("epos2"))
+    K_t = made[TORQUE_PER_AMPERE]
+    assert made["position.inertia_ff_kgm2"] == pytest.approx(65535e-6 * K_t, rel=1e-4)
+    assert any("its object holds no more" in note for note in made.notes)
+    assert "axis_following_error_rad" not in made.facts  # it was predicted with all of it
+
+
+def test_stored_gains_in_amperes_are_compared_where_the_drive_holds_no_torque_of_an_ampere() -> None:
+    """One controller of the position decides how a move is followed: the gains of the speed may be anything."""
+    source, drive_map = machine(), load_family("epos2")
+    assert own_torque(source, load_family("epos4")) == {} and own_torque(source, load_family("ingenia")) == {}
+    made = design_axis(source, TuneRequest(), ASKED, drive_map)
+    K_t = own_torque(source, drive_map)
+    names = (*PID[:3], "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad", "position.inertia_ff_kgm2")
+    wanted = ParameterSet({name: made[name] for name in names} | K_t)
+    encoded = drive_map.encode(wanted)
+    entries = [Entry(name, *drive_map.address(name), data, data) for name, data in encoded.items()]
+    held = snapshot_set(drive_map, entries, K_t).values
+    assert held[PID[0]] == pytest.approx(made[PID[0]], rel=1e-2)
+    stiffer = held | {name: held[name] * 1.2**power for name, power in zip(PID, (2, 3, 1), strict=False)}
+    kept = design_axis(source, TuneRequest(), ASKED, drive_map, {**stiffer, "speed.K_p_nms_per_rad": 1e3})
+    assert kept[PID[0]] == pytest.approx(stiffer[PID[0]], rel=1e-2)
+    assert kept["speed.K_p_nms_per_rad"] == made["speed.K_p_nms_per_rad"]
+    assert snapshot_set(drive_map, entries).values.get(PID[0]) is None
