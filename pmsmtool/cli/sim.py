@@ -134,7 +134,10 @@ def _operate(line: Line, channel: Channel, out: Output) -> None:
 def _how_to_join(host: str, port: int) -> str:
     if (host, port) == ("127.0.0.1", 29536):
         return "join with: pmsmtool -i socketcand -c vcan0 scan"
-    return f'join with: can.Bus(interface="socketcand", host="{host}", port={port}, channel="vcan0", tcp_tune=True)'
+    return (
+        f'join with: can.Bus(interface="socketcand", host="{host}", port={port}, channel="vcan0", tcp_tune=True); '
+        f"pmsmtool with the lines `host = {host}` and `port = {port}` below `[default]` in ~/can.conf"
+    )
 
 
 def _serve(server: SocketcandServer) -> None:

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from pmsmtool.cli import options
 from pmsmtool.cli.options import BusOptions, MotionOptions
 from pmsmtool.cli.output import Output
+from pmsmtool.cli.sim import _how_to_join
 from tests.cli.conftest import Tool
 
 
@@ -113,3 +114,10 @@ def test_a_dash_is_no_file(tool: Tool) -> None:
     """Before, ``-o -`` left a file of that name."""
     code, _, err = tool("tune", "interior-2k2", "-o", "-")
     assert code == 2 and "'-' is not the name of a file" in err and not Path("-").exists()
+
+
+def test_a_served_drive_on_another_port_is_joined_by_a_file_that_python_can_reads() -> None:
+    """Before, a person was given a line of Python alone: no option of the command line has host and port."""
+    said = _how_to_join("127.0.0.1", 29700)
+    assert "`host = 127.0.0.1` and `port = 29700` below `[default]` in ~/can.conf" in said
+    assert _how_to_join("127.0.0.1", 29536).endswith("pmsmtool -i socketcand -c vcan0 scan")
