@@ -37,7 +37,7 @@ def parse_toml(text: str, *, where: str) -> dict[str, Any]:
         tables = tomllib.loads(text.removeprefix("\ufeff"))  # Windows editors begin UTF-8 with this mark
     except (ValueError, RecursionError) as error:  # beside its own error: numbers of 5000 digits, brackets 1000 deep
         raise ConfigError(
-            f"is not TOML: {error}", where=where, likely="a missing quote or bracket, or a decimal comma"
+            f"the file is not TOML: {error}", where=where, likely="a missing quote or bracket, or a decimal comma"
         ) from None
     for name, number in _whole_numbers(tables, ""):
         if not -LARGEST_WHOLE <= number < LARGEST_WHOLE:

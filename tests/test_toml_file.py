@@ -20,7 +20,7 @@ def test_tables_are_returned(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("a = ", "is not TOML"),
+        ("a = ", "the file is not TOML"),
         ("a = " + "9" * 5000, "is not TOML"),
         ("a = " + "[" * 100_000, "is not TOML"),
         ("[t]\na = 9223372036854775808", "f.toml:t.a: is a whole number beyond the 64 bit"),

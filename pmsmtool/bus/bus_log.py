@@ -64,7 +64,9 @@ class BusLog:
                 pass
         except OSError as error:
             raise ConfigError(
-                error.strerror or str(error), where=str(path), hint="give a file that you may read"
+                f"the log cannot be read: {error.strerror or error}",
+                where=str(path),
+                hint="give a file that you may read",
             ) from error
 
     def frames(self) -> Iterator[LogFrame]:
