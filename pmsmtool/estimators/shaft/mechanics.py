@@ -276,10 +276,10 @@ def mean_mechanics(
     runs = [_fast(_fast(_window(run))) for run in runs]  # the second time without a long rest
     step = encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, 0.0, 0.0, direction, step, NO_HARMONICS, 0.0)[1] for run in runs]
-    values, stds, _ = _mean_motion(blocks)
+    values, stds, _ = _mean_motion(blocks, power=1.0)
     if not values[0] > 0.0:
         return {}
-    if _doubt(blocks, *stds[1:]) > largest_torque(blocks):
+    if COVERAGE_FACTOR * max(stds[1] * fastest(blocks), stds[2]) > largest_torque(blocks):
         values = values[:1]
     scale, systematic = math.hypot(MEAN_STD, scale_std), (tolerance or SensorTolerance()).inertia
     return {
@@ -290,13 +290,9 @@ def mean_mechanics(
 
 def require_useful(runs: Sequence[Run], B_std: float, tau_std: float) -> None:
     """Refuse friction that may be more than what turned the shaft: a fit that ran away, and J with it."""
-    if (doubt := _doubt(runs, B_std, tau_std)) > (largest := largest_torque(runs)):
+    if (doubt := COVERAGE_FACTOR * max(B_std * fastest(runs), tau_std)) > (largest := largest_torque(runs)):
         raise refuse("E_NOT_IDENTIFIABLE", f"friction is known to +-{doubt:.2g} N m, the pulses made {largest:.2g} N m",
                      stage=STAGE, likely=NOISY_TORQUE)  # fmt: skip
-
-
-def _doubt(runs: Sequence[Run], B_std: float, tau_std: float) -> float:
-    return COVERAGE_FACTOR * max(B_std * fastest(runs), tau_std)
 
 
 Fitted = tuple[Sequence[Run], Fit, float, Sequence[Run]]
@@ -396,8 +392,11 @@ def _start(runs: Sequence[Run]) -> Array:
     return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
 
 
-def _mean_motion(runs: Sequence[Run]) -> tuple[Array, list[float], list[float]]:
-    """Return J, B, tau_c of the mean torques and motions of half traces, their deviations, and the first states."""
+def _mean_motion(runs: Sequence[Run], power: float = 0.0) -> tuple[Array, list[float], list[float]]:
+    """Return J, B, tau_c of the mean torques and motions of half traces, their deviations, and the first states.
+
+    With a ``power`` of 1 errors are a share of the acceleration: pushes tell J, coasting friction; no half is at rest.
+    """
     rows, torques, states = [], [], []
     for run in runs:
         t = run.T * np.arange(len(run.theta))
@@ -409,8 +408,9 @@ def _mean_motion(runs: Sequence[Run]) -> tuple[Array, list[float], list[float]]:
             torques.append(float(np.mean(run.torque[part])))
         first = np.polyfit(t[: len(t) // 4], run.theta[: len(t) // 4], 2)
         states += [run.theta[0], float(first[1])]
-    change = np.abs(np.array(rows)[:, 0])  # in proportion to its error: pushes tell J, coasting tells the friction
-    x, covariance, residual, _ = linear_solve(np.array(rows), np.array(torques), 1.0 / (change + 1e-3 * max(change)))
+    change = np.abs(np.array(rows)[:, 0])
+    weight = (change + 1e-3 * np.max(change)) ** -power
+    x, covariance, residual, _ = linear_solve(np.array(rows), np.array(torques), weight)
     return x, np.sqrt(np.diag(covariance) * (residual @ residual) / (len(rows) - len(x))).tolist(), states
 
 
