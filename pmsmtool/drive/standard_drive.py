@@ -42,6 +42,8 @@ COMMUTATION_ANGLE = DriveObject(0x60EA, 0, "H")
 ANGLE_COUNTS = 1 << 16
 """Counts of 0x60EA per electrical turn."""
 RESISTANCE = "motor.R_s_ohm"
+SPEED_S = 0.02
+"""Shortest time between two looks at the position that show a speed."""
 POLL_PERIOD_S = 1e-3
 """Live values are polled about this often: process data of a CAN bus do not come faster."""
 SPARE_ROWS = 8
@@ -76,7 +78,7 @@ class StandardDrive(CanopenDrive):
         self.period_s = POLL_PERIOD_S
         self.recorder: Recorder = PolledMeans(self.node, self.live)
         self._last_counts: float | None = None
-        self._last_s = 0.0
+        self._since: tuple[float, float] = (0.0, 0.0)  # counts, and the instant (s) before they were asked for
         self._speed_rad_s = 0.0
         self.counts_per_turn = position_units(self.node)
         self._rated_apk = rated_apk(self.node)
@@ -116,15 +118,23 @@ class StandardDrive(CanopenDrive):
         raise NotAvailable(f"the drive does not show {name}", where=f"node {self.node.node}")
 
     def _position_rad(self) -> float:
-        """Return the unwrapped mechanical angle; its change since the last look is the speed."""
-        counts, now = self.node.get(POSITION), self.node.connection.clock.now()
-        if self._last_counts is not None:
+        """Return the unwrapped mechanical angle; its change over :data:`SPEED_S` and more is the speed.
+
+        An answer may come any time after the drive looked, so that of two looks 1 ms apart the speed is anything: the
+        time counted is that from the older request to the newer answer, which no speed is too large for.
+        """
+        clock = self.node.connection.clock
+        asked_s, counts, now = clock.now(), self.node.get(POSITION), clock.now()
+        if self._last_counts is None:
+            self._since = counts, asked_s
+        else:
             step = counts - self._last_counts
-            step -= round(step / 2.0**32) * 2.0**32
-            counts = self._last_counts + step
-            if now > self._last_s:
-                self._speed_rad_s = 2.0 * math.pi * step / self.counts_per_turn / (now - self._last_s)
-        self._last_counts, self._last_s = counts, now
+            counts = self._last_counts + step - round(step / 2.0**32) * 2.0**32
+        self._last_counts = counts
+        older, older_s = self._since
+        if now - older_s >= SPEED_S:
+            self._speed_rad_s = 2.0 * math.pi * (counts - older) / self.counts_per_turn / (now - older_s)
+            self._since = counts, asked_s
         return 2.0 * math.pi * counts / self.counts_per_turn
 
     def enable(self) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,14 +20,20 @@ ANSWER_RAD = 0.02
 LEAST_RAMP_S = 0.04
 CHECK_S = 0.012
 """Speed is looked at this often while the machine runs up to its voltage."""
+SLOW_ANSWERS = 6
+"""Times that this is doubled for a drive that answers slowly; one that is not seen then is taken to be too fast."""
 RUNNING = 0.2
 """Speed, of the largest one, above which it is looked for."""
 PATIENCE = 3.0
 """Longest run-up, over that at the current of the top."""
 STALLED_SHARE = 0.25
 """Acceleration, of the first one at the same current, at which the voltage is taken to be the limit."""
+STALL_CHECKS = 5
+"""Looks over which it is found: one look that comes 1 ms late is more than the acceleration of a light shaft."""
 LEAST_NET = 0.5
 """Of a current, what is taken to accelerate at least: friction is known roughly."""
+SLOWEST_NET = 0.25
+"""The same, where it says how long a run-up may take."""
 RUN_SHARE = 0.5
 """Current of the run-up, of the test current."""
 HOLD_SHARE = 0.08
@@ -117,24 +124,27 @@ def run_to_voltage(drive: Drive, plan: PolledPushPlan, answer: ShaftAnswer) -> T
     """
     top, found = plan.omega_top_rad_s, None
     hold = min(HOLD_SHARE * plan.i_test_a, plan.most_a(answer, top))
-    before, speed, spent = drive.live("theta_m_rad"), 0.0, 0.0
-    while spent < PATIENCE * top / (answer.per_ampere * hold):
+    speed, spent = 0.0, 0.0
+    speeds, expected = deque([0.0], STALL_CHECKS + 1), deque([0.0], STALL_CHECKS)
+    slowest = answer.per_ampere * max(hold - answer.friction_a, SLOWEST_NET * hold)
+    while spent < PATIENCE * top / slowest:
         # what is left to the top is approached by halves, so that a weak voltage is seen before it
-        nearer = min(0.5 * (top - speed) / (answer.per_ampere * CHECK_S), plan.most_a(answer, speed))
+        # the speed is a mean, half a look old, and goes on for one more
+        ahead = speed + 1.5 * expected[-1]
+        nearer = min(0.5 * (top - speed) / (answer.per_ampere * CHECK_S), plan.most_a(answer, ahead))
         current = min(RUN_SHARE * plan.i_test_a, max(hold, nearer))
         drive.command_current(0.0, current)
-        drive.wait(CHECK_S)
+        speed = _speed(drive)
         spent += CHECK_S
-        angle = drive.live("theta_m_rad")
-        now, last = abs(angle - before) / CHECK_S, speed
-        before, speed = angle, now
-        if now > top:
+        ends = speed + answer.per_ampere * max(0.0, current - answer.friction_a) * plan.off_s
+        if speed > top or ends > plan.omega_failure_rad_s:  # the least that overcomes friction is too much from here
             break
-        net = max(current - answer.friction_a, LEAST_NET * current)
-        if last > RUNNING * top and now - last < STALLED_SHARE * answer.per_ampere * net * CHECK_S:
+        speeds.append(speed)
+        expected.append(answer.per_ampere * max(current - answer.friction_a, LEAST_NET * current) * CHECK_S)
+        if speeds[0] > RUNNING * top and speed - speeds[0] < STALLED_SHARE * sum(expected):
             drive.command_current(0.0, hold)
-            drive.wait(HOLD_S)
-            found = _steady_top(drive, hold, top)
+            if _holds(drive, top):
+                found = _steady_top(drive, hold, top)
             break
     brake_shaft(drive, plan.stop_a(answer), answer)
     return found
@@ -158,6 +168,30 @@ def coast_both_ways(
         brake_shaft(drive, plan.stop_a(answer), answer)
 
 
+def _holds(drive: Drive, top_rad_s: float) -> bool:
+    """Let the current settle; whether the speed then stays below the top for a record more."""
+    first = speed = _speed(drive)
+    spent = CHECK_S
+    while spent < HOLD_S and speed <= top_rad_s:
+        speed = _speed(drive)
+        spent += CHECK_S
+    return speed + max(0.0, speed - first) <= top_rad_s
+
+
+def _speed(drive: Drive) -> float:
+    """Return the speed (rad/s, no sign) over :data:`CHECK_S`, by the instants at which the position was read.
+
+    Of a drive that answers so slowly that it is seen once, that is over as long as two looks take.
+    """
+    samples = max(2, round(CHECK_S / drive.period_s))
+    for _ in range(SLOW_ANSWERS):
+        seen = readable(drive.record(SIGNALS, samples))
+        if len(seen) > 1 and seen.t_s[-1] > seen.t_s[0]:
+            return float(abs(seen["theta_M_rad"][-1] - seen["theta_M_rad"][0]) / (seen.t_s[-1] - seen.t_s[0]))
+        samples *= 2
+    return math.inf
+
+
 def _steady_top(drive: Drive, command_a: float, top_rad_s: float) -> Trace | None:
     """Record until speed and current are steady, or :data:`HOLDS` times; None where it goes beyond the top speed.
 
@@ -169,8 +203,8 @@ def _steady_top(drive: Drive, command_a: float, top_rad_s: float) -> Trace | Non
         t, angle = found.t_s, found["theta_M_rad"]
         half = len(t) // 2
         first, second = (abs(angle[k + half - 1] - angle[k]) / (t[k + half - 1] - t[k]) for k in (0, len(t) - half))
-        if second > top_rad_s:
-            return None
+        if second + 2.0 * max(0.0, second - first) > top_rad_s:
+            return None  # at the end of the next record
         if abs(second - first) <= 0.5 * STEADY * second and abs(current_rise(found)) <= RISING:
             break
     return found

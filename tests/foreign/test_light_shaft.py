@@ -91,6 +91,30 @@ def test_no_push_goes_beyond_the_plans_speed(rate: float) -> None:
         assert max(shaft.asked) == pytest.approx(7.0), "a heavier shaft is pushed as before"
 
 
+class LateShaft(Shaft):
+    """Behind a tool whose waits take up to a sixth longer than asked, as on a busy computer."""
+
+    def __init__(self, rate: float, friction: float, voltage_rad_s: float, seed: int) -> None:
+        super().__init__(rate, friction, 1, voltage_rad_s)
+        self._late = np.random.default_rng(seed)
+
+    def wait(self, seconds: float) -> None:
+        late = seconds != self.period_s and seconds > 1e-3
+        super().wait(seconds * (1.0 + self._late.uniform(0.0, 1.0 / 6.0)) if late else seconds)
+
+
+@pytest.mark.parametrize("voltage_rad_s", [90.0, math.inf])
+@pytest.mark.parametrize("seed", range(6))
+def test_late_looks_take_no_light_shaft_beyond_the_top(seed: int, voltage_rad_s: float) -> None:
+    """A look 1 ms late was taken for the voltage's limit; the shaft ran on for 0.8 s: 2759 rpm of 2000 allowed."""
+    shaft = LateShaft(2300.0, 0.05, voltage_rad_s, seed)
+    plan = PolledPushPlan(10.0, 40.0, 100.0, omega_failure_rad_s=MOST, off_s=0.5)
+    answer = push_both_ways(cast(Drive, shaft), plan, lambda name, trace: None)
+    shaft.fastest = 0.0
+    run_to_voltage(cast(Drive, shaft), plan, answer)
+    assert shaft.fastest < 1.1 * plan.omega_top_rad_s  # measured 1.01
+
+
 HEAVY = [(rate, share * 10.0) for rate in (3.0, 40.0) for share in (0.0, 0.03, 0.2)]
 LIGHT_TO_HEAVY = [*HEAVY, (1e3, 0.0), (1e3, 0.1), (4e3, 0.1)]
 """At 10 A, 30 to 40 000 rad/s2 (a servo of 50 W). On a light one friction of a tenth of the torque would let the push
