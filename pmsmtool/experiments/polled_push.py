@@ -20,8 +20,6 @@ ANSWER_RAD = 0.02
 LEAST_RAMP_S = 0.04
 CHECK_S = 0.012
 """Speed is looked at this often while the machine runs up to its voltage."""
-SLOW_ANSWERS = 6
-"""Times that this is doubled for a drive that answers slowly; one that is not seen then is taken to be too fast."""
 RUNNING = 0.2
 """Speed, of the largest one, above which it is looked for."""
 PATIENCE = 3.0
@@ -181,15 +179,12 @@ def _holds(drive: Drive, top_rad_s: float) -> bool:
 def _speed(drive: Drive) -> float:
     """Return the speed (rad/s, no sign) over :data:`CHECK_S`, by the instants at which the position was read.
 
-    Of a drive that answers so slowly that it is seen once, that is over as long as two looks take.
+    A drive that answers so slowly that it is not seen twice is taken to be too fast.
     """
-    samples = max(2, round(CHECK_S / drive.period_s))
-    for _ in range(SLOW_ANSWERS):
-        seen = readable(drive.record(SIGNALS, samples))
-        if len(seen) > 1 and seen.t_s[-1] > seen.t_s[0]:
-            return float(abs(seen["theta_M_rad"][-1] - seen["theta_M_rad"][0]) / (seen.t_s[-1] - seen.t_s[0]))
-        samples *= 2
-    return math.inf
+    seen = readable(drive.record(SIGNALS, 2, decimation=max(1, round(CHECK_S / drive.period_s))))
+    if len(seen) < 2 or not seen.t_s[-1] > seen.t_s[0]:
+        return math.inf
+    return float(abs(seen["theta_M_rad"][-1] - seen["theta_M_rad"][0]) / (seen.t_s[-1] - seen.t_s[0]))
 
 
 def _steady_top(drive: Drive, command_a: float, top_rad_s: float) -> Trace | None:

@@ -44,6 +44,7 @@ from pmsmtool.identification.sampling import resistance_as_sampled
 from pmsmtool.identification.wiring import Finding, supply_power, supply_under_load
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
+from pmsmtool.machine.two_masses import SLOWEST_UNSEEN_HZ
 from pmsmtool.plain_text import counted
 from pmsmtool.trace import Trace
 
@@ -69,7 +70,8 @@ class Evaluation:
     ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics``, ``frf``,
     ``cogging`` and ``harmonics``. ``means`` are inertia and friction by mean accelerations, by their keys, where no
     model explains the pushes, and ``encoder_errors`` those of the position once and twice per turn (rad);
-    ``swing_hz`` is where pushes swing the shaft and no linear response does (Hz).
+    ``swing_hz`` is where pushes swing the shaft and no linear response does (Hz), ``unseen_hz`` from where on a shaft
+    that is not rigid may swing unseen.
     ``encoder_noise_rad`` is the standard deviation of a position at rest, without what drifts (mechanical).
     ``supply_w`` is the power from which on the DC link gives way (W).
     """
@@ -88,6 +90,7 @@ class Evaluation:
     means: Mapping[str, Estimate] = field(default_factory=dict)
     encoder_errors: Mapping[int, float] = field(default_factory=dict)
     swing_hz: float = 0.0
+    unseen_hz: float = 0.0
     flux_map: FluxMapResult | None = None
     frequency_response: FrequencyResponse | None = None
     cogging: Cogging | None = None
@@ -288,8 +291,13 @@ def evaluate(
     if pushes is not None and "mechanics" in refused and refused["mechanics"].reason in NOT_RIGID:
         elastic, means, response = of_no_rigid_shaft(pushes, response)
         swing_hz = 0.0 if response is not None and response.found else pushes.swing_hz(response)
+        unseen_hz = 0.0
+        if not swing_hz and (response is None or not response.found):
+            unseen_hz = SLOWEST_UNSEEN_HZ if response is None else max(response.shown_hz, SLOWEST_UNSEEN_HZ)
         errors = {} if elastic is not None else frequency_response.encoder_errors_of(traces, moving)
-        moving = replace(moving, mechanics=elastic, means=means, encoder_errors=errors, swing_hz=swing_hz)
+        moving = replace(
+            moving, mechanics=elastic, means=means, encoder_errors=errors, swing_hz=swing_hz, unseen_hz=unseen_hz
+        )
         if elastic is not None or "tau_c_nm" in means:
             del refused["mechanics"]
     elif moving.mechanics is not None:

@@ -19,7 +19,7 @@ from pmsmtool.identification.sampling import timing_warnings
 from pmsmtool.identification.wiring import SUPPLY, WRONG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.machine.two_masses import SWING
+from pmsmtool.machine.two_masses import SWING, UNSEEN
 from pmsmtool.run_directory import Acceptance
 from pmsmtool.units import format_estimate
 
@@ -154,6 +154,8 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions[frequency_response.SHOWN] = frequency_response.shown_of(evaluation.frequency_response)
     if evaluation.swing_hz:
         conditions[SWING] = evaluation.swing_hz
+    if evaluation.unseen_hz:
+        conditions[UNSEEN] = evaluation.unseen_hz
     errors_rad = dict(evaluation.encoder_errors)
     if evaluation.mechanics is not None:
         if evaluation.mechanics.drag is not None:

@@ -8,6 +8,7 @@ both against each other at the resonance f_r, and J_M / J = (f_a / f_r)^2.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,6 +33,13 @@ SWING_RATIOS, SWING_DAMPING, SWING_FACTOR = (1.0, 10.0), 0.03, 1.5
 """Load over motor and damping that the speed loop must then bear, within this factor of the frequency either way: most
 of the ranges of an elastic shaft (0.2 to 20, 0.5 to 5 %). Pulses of a gear of 184 Hz with 1.1 degrees of play swing at
 140 and 153 Hz."""
+
+
+UNSEEN = "shaft_unseen_above_hz"
+"""Condition of a machine file: up to where (Hz) a response shows no second mass of a shaft that is not rigid.
+What swings above is not known, and the speed loop bears it anywhere from there on."""
+SLOWEST_UNSEEN_HZ, FASTEST_UNSEEN_HZ, UNSEEN_TRIED = 20.0, 800.0, 9
+"""The same without a response, up to where couplings and gears swing (50 to 800 Hz), and frequencies between."""
 
 
 PLAY_ZETA, PLAY_FACTOR, PLAY_STEPS = 0.05, 2.0, 4
@@ -134,9 +142,11 @@ def mechanics_of(source: MachineFile) -> Mechanics:
 def shafts_of(source: MachineFile) -> list[Mechanics]:
     """Return the shaft of a machine file, and what else it may be; nothing where it is one mass."""
     f_r, f_a = source.machine.resonance_hz, source.machine.antiresonance_hz
-    swing_hz = source.conditions.get(SWING)
+    swing_hz, unseen_hz = source.conditions.get(SWING), source.conditions.get(UNSEEN)
     if source.machine.J_kgm2 and f_r is None and isinstance(swing_hz, float):
-        return _with_play(mechanics_of(source), swing_hz)
+        return _swinging(mechanics_of(source), (swing_hz / SWING_FACTOR, swing_hz, swing_hz * SWING_FACTOR))
+    if source.machine.J_kgm2 and f_r is None and isinstance(unseen_hz, float):
+        return _swinging(mechanics_of(source), np.geomspace(unseen_hz, max(unseen_hz, FASTEST_UNSEEN_HZ), UNSEEN_TRIED))
     if not source.machine.J_kgm2 or f_r is None or f_a is None or not f_a < f_r:
         return []
     nominal = mechanics_of(source)
@@ -168,17 +178,19 @@ def why_slower(source: MachineFile, rigid_rad_s: float, slowed_rad_s: float) -> 
     if slowed_rad_s >= rigid_rad_s:
         return ()
     swing_hz, f_r = source.conditions.get(SWING), source.machine.resonance_hz
-    shaft = f"swings at {f_r:.3g} Hz" if f_r else f"has play, and torque pulses swing it at {swing_hz:.3g} Hz"
+    if f_r is None and swing_hz is None:
+        shaft = f"is not rigid, and what swings above {source.conditions.get(UNSEEN):.3g} Hz is not known"
+    else:
+        shaft = f"swings at {f_r:.3g} Hz" if f_r else f"has play, and torque pulses swing it at {swing_hz:.3g} Hz"
     rigid_hz, hz = rigid_rad_s / (2.0 * math.pi), slowed_rad_s / (2.0 * math.pi)
     return (f"speed loop of {hz:.3g} Hz instead of {rigid_hz:.3g} Hz: the shaft {shaft}, where a faster loop hunts",)
 
 
-def _with_play(whole: Mechanics, swing_hz: float) -> list[Mechanics]:
-    """Return one mass, and the elastic shafts that may swing so."""
-    frequencies = (swing_hz / SWING_FACTOR, swing_hz, swing_hz * SWING_FACTOR)
+def _swinging(whole: Mechanics, frequencies_hz: Iterable[float]) -> list[Mechanics]:
+    """Return one mass, and the elastic shafts that may swing at some frequencies."""
     return [whole] + [
         replace(whole, antiresonance_hz=hz / math.sqrt(1.0 + ratio), resonance_hz=hz, zeta=SWING_DAMPING)
-        for hz in frequencies
+        for hz in map(float, frequencies_hz)
         for ratio in SWING_RATIOS
     ]
 

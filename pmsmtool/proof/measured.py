@@ -22,6 +22,8 @@ REACH_S = 4.0
 REACH_FACTOR = 2.0
 """A speed that is not reached by then, and by this many times what the design's slope takes, is not waited for any
 longer."""
+REACH_TIMES = 60.0
+"""The same, of the time constant of the speed loop: the one of a shaft with play (1 Hz) was 12 % short after 4 s."""
 REACHED = 0.05
 """Relative distance from its speed at which an experiment is not begun."""
 KEPT = (-0.05, 0.02)
@@ -111,7 +113,8 @@ def _recorded(
             if not omega_e:
                 _come_to_rest(drive, pole_pairs)  # the shaft may still turn from what was done before
         if omega_e:
-            limit_s = max(REACH_S, _ramp_s(drive, experiment.base_rad_s, pole_pairs))
+            crossover = float(design.facts.get("speed_crossover_rad_s", math.inf))
+            limit_s = max(REACH_S, _ramp_s(drive, experiment.base_rad_s, pole_pairs), REACH_TIMES / crossover)
             if reach(drive, omega_e, limit_s=limit_s) >= limit_s:
                 _refuse_other_speed(drive, experiment, omega_e, limit_s, design, conditions)
             drive.wait(experiment.settle_s)

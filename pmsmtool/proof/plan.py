@@ -16,7 +16,7 @@ from pmsmtool.identification.frequency_response import NOTHING, RIGID, SHOWN
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, MEAN_FALLBACK, PLAY_FALLBACK
 from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.machine.two_masses import SWING
+from pmsmtool.machine.two_masses import SWING, UNSEEN
 from pmsmtool.units import RAD_S_PER_RPM
 
 RPM = RAD_S_PER_RPM
@@ -330,6 +330,8 @@ def _unmodelled(design: Design) -> str:
         return "the shaft has play, which nothing predicts"
     if SWING in machine.conditions:
         return "torque pulses swing the shaft as no known resonance does: play, or an elastic coupling"
+    if UNSEEN in machine.conditions:
+        return "the shaft is not rigid, and what swings is not known: play, or an elastic coupling"
     if machine.conditions.get(SHOWN, RIGID) not in (RIGID, NOTHING) and machine.machine.resonance_hz is None:
         return "the shaft is not rigid, and no resonance was found: play, or an elastic coupling with much damping"
     return ""

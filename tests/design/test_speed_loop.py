@@ -11,6 +11,7 @@ import pytest
 
 from pmsmtool.axis.loops import AxisGains, AxisPath, lifted, open_loop
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
+from pmsmtool.design.loops.open_loops import open_loops
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import (
     ELASTIC_MODULUS,
@@ -30,7 +31,7 @@ from pmsmtool.design.loops.speed_loop import (
 from pmsmtool.design.tune import tune
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.two_masses import SWING, Mechanics
+from pmsmtool.machine.two_masses import SWING, UNSEEN, Mechanics
 from tests.design.test_current_loop import scaled
 
 R, L_Q, T_S, J, B = 0.137, 2.1e-3, 1.0 / 12e3, 0.05, 0.01
@@ -206,7 +207,22 @@ def test_a_design_says_why_its_speed_loop_is_slow() -> None:
     elastic = replace(
         rigid, machine=replace(rigid.machine, resonance_hz=60.0, antiresonance_hz=20.0, resonance_zeta=0.01)
     )
-    said = {name: " ".join(tune(source).notes) for name, source in (("play", swinging), ("elastic", elastic))}
+    unseen = replace(rigid, conditions={**rigid.conditions, UNSEEN: 25.8})
+    named = (("play", swinging), ("elastic", elastic), ("unseen", unseen))
+    said = {name: " ".join(tune(source).notes) for name, source in named}
+    assert "the shaft is not rigid, and what swings above 25.8 Hz is not known" in said["unseen"]
     assert "instead of 13.1 Hz: the shaft has play, and torque pulses swing it at 140 Hz" in said["play"]
     assert "instead of 13.1 Hz: the shaft swings at 60 Hz, where a faster loop hunts" in said["elastic"]
     assert "instead of" not in " ".join(tune(rigid).notes)
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("hz", [30.0, 100.0, 184.0, 600.0])
+@pytest.mark.parametrize("ratio", [1.0, 2.0, 9.0])
+def test_a_loop_for_what_is_not_known_holds_whatever_swings(hz: float, ratio: float) -> None:
+    """Designed as for a rigid shaft, the loop of a gear of 184 Hz ended in over-speed."""
+    base = load_machine_file("interior-2k2")
+    unseen = tune(replace(base, conditions={**base.conditions, UNSEEN: 25.8}))
+    truth = replace(base.machine, resonance_hz=hz, antiresonance_hz=hz / math.sqrt(1.0 + ratio), resonance_zeta=0.03)
+    known = replace(unseen, machine=replace(unseen.machine, machine=truth, conditions=base.conditions))
+    assert margins(open_loops(known)["speed"]).stable

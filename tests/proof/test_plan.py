@@ -22,7 +22,7 @@ from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.machine.torque import iron_drag
-from pmsmtool.machine.two_masses import PLAY_FACTOR, SWING
+from pmsmtool.machine.two_masses import PLAY_FACTOR, SWING, UNSEEN
 from pmsmtool.proof.drawn_machine import EMF_HARMONICS, FRICTION_FACTOR, LAG_SHARES, LATE_SHARE
 from pmsmtool.proof.judgement import LEAST_STEADY_ROWS
 from pmsmtool.proof.plan import LONGEST_S, RPM, SIGNALS, STEPS, WEAKENING_SLOPE, Conditions, plan_proof
@@ -104,9 +104,10 @@ def test_of_a_shaft_that_bends_in_a_way_that_nothing_tells_only_currents_are_pre
     assert [e.name for e in plan.experiments] == ["q_steps", "d_steps", "unreachable"]
     assert any(line.startswith("speed step, field weakening: the shaft is not rigid") for line in plan.left_out)
     rigid = shown(design(), "rigid")
-    swinging = replace(rigid.machine, conditions={**rigid.machine.conditions, SWING: 140.0})
-    pushed = plan_proof(replace(rigid, machine=swinging), conditions(made))
-    assert [e.name for e in pushed.experiments] == ["q_steps", "d_steps", "unreachable"]
+    for unknown in ({SWING: 140.0}, {UNSEEN: 25.8}):
+        swinging = replace(rigid.machine, conditions={**rigid.machine.conditions, **unknown})
+        pushed = plan_proof(replace(rigid, machine=swinging), conditions(made))
+        assert [e.name for e in pushed.experiments] == ["q_steps", "d_steps", "unreachable"]
     known = replace(made.machine.machine, resonance_hz=200.0, antiresonance_hz=100.0, resonance_zeta=0.02)
     told = replace(made, machine=replace(made.machine, machine=known))
     assert "speed_step" in [e.name for e in plan_proof(told, conditions(made)).experiments]
@@ -229,9 +230,10 @@ def test_an_inertia_that_counts_for_nothing_leaves_the_steps_to_the_voltage(J_kg
     assert "unreachable" in [e.name for e in plan.experiments]
 
 
-BEGUN = 0.06
+BEGUN = 0.08
 """Speed at the beginning of a record beyond what is drawn, relative: a 12-bit encoder 0.01; besides a sensor lag of 0.4
-periods, whose current speeds a light shaft up while it coasts, 0.049."""
+periods, whose current speeds a light shaft up while it coasts, 0.049; 0.073 where friction takes a quarter of it in 64
+periods, which the drive's speed estimate follows late (0.22 where it was started again only once)."""
 
 
 @pytest.mark.parametrize("psi_f_wb", [0.005, 0.02])

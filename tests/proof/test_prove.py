@@ -311,6 +311,7 @@ def test_a_speed_that_is_not_reached_is_named(design: Design, monkeypatch: pytes
     monkeypatch.setattr(measured, "RISE_S", 0.0)
     monkeypatch.setattr(measured, "REACH_S", 0.0)
     monkeypatch.setattr(measured, "REACH_FACTOR", 0.0)
+    monkeypatch.setattr(measured, "REACH_TIMES", 0.0)
     with flashed(design) as drive:
         _, stage = prove(drive, design)
         assert is_safe(drive.node.state())

@@ -61,16 +61,13 @@ START_STEP = 0.02
 START_ZETAS = (0.003, 0.01, 0.05, 0.2)
 LN_LARGEST = 20.0
 """Largest logarithm of a frequency (rad/s) or damping that a fit may try."""
-SHOWN_RATIO, SHOWN_ZETA = 0.2, 0.01
-"""Load over motor and damping of the resonance whose least visible frequency is told where none is found."""
-SHOWN_TRIED = 60
-"""Frequencies tried for it."""
+SHOWN_RATIO, SHOWN_ZETA, SHOWN_TRIED = 0.2, 0.01, 60
+"""Load over motor and damping of the resonance whose largest visible frequency is told where none is found; tries."""
 ZETA_FLOOR = 0.01
 """Relative deviation of the damping beyond the fit's: rows do not show the current between them. Measured on one
 simulated drive: 0.014 too much, 0.005 by the fit."""
 INERTIA_FLOOR = 1e-3
-"""Relative deviation of the inertia beyond the fit's and the torque's: see
-``tests/measurement/test_frequency_response``."""
+"""Relative deviation of the inertia beyond the fit's and the torque's (tests/measurement/test_frequency_response)."""
 INERTIA_FALLBACK = "from the frequency response alone: friction is not known, and a load behind a play is not seen"
 METHOD = "random torque at speed, maximum likelihood in the frequency domain"
 
@@ -102,6 +99,8 @@ class FrequencyResponse:
     inertia : Estimate or None
         All that turns, of the model that explains the response: 1/J of a rigid shaft, the low-frequency end
         J_M w_r^2/w_a^2 of two masses (kg m2); None where neither explains it.
+    shown_hz : float
+        Up to where a small second mass would have shown, where none is found (Hz); 0: nowhere.
     """
 
     frequency_hz: Array
@@ -115,6 +114,7 @@ class FrequencyResponse:
     found: dict[str, Estimate] = field(default_factory=dict)
     reason: str = ""
     inertia: Estimate | None = None
+    shown_hz: float = 0.0
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the table that is kept as a file."""
@@ -209,11 +209,11 @@ def _judged(
     chi2_rigid = rigid.cost / rigid.dof
     facts = (frequency, G, std, coherence, highest, chi2_rigid)
     one = _inertia(rigid, chi2_rigid, (-1.0, 0.0), *scale)
-    shown = _shown(lines, rigid)
+    shown, to_hz = _shown(lines, rigid)
     start = _start(lines.omega, G, std)
     if start is None:
         reason = f"rigid up to {highest:.3g} Hz: no pair of poles fits; {shown}"
-        return FrequencyResponse(*facts, math.nan, 0.0, reason=reason, inertia=one), lines, rigid
+        return FrequencyResponse(*facts, math.nan, 0.0, reason=reason, inertia=one, shown_hz=to_hz), lines, rigid
     two = _fit(lines, _two_mass, start)
     chi2 = two.cost / two.dof
     # the same transients, rung by something else than the torque
@@ -225,8 +225,8 @@ def _judged(
     estimates = _estimates(two, chi2)
     against = _against(two, chi2, gain, estimates, frequency)
     if against:
-        reason = f"no resonance found up to {highest:.3g} Hz: {against}"
-        return FrequencyResponse(*facts, chi2, gain, reason=f"{reason}; {shown}", inertia=one), lines, rigid
+        reason = f"no resonance found up to {highest:.3g} Hz: {against}; {shown}"
+        return FrequencyResponse(*facts, chi2, gain, reason=reason, inertia=one, shown_hz=to_hz), lines, rigid
     resonance, antiresonance = estimates["resonance_hz"].value, estimates["antiresonance_hz"].value
     reason = f"two masses, J_load/J_motor {(resonance / antiresonance) ** 2 - 1.0:.3g}, over {highest:.3g} Hz"
     both = _inertia(two, chi2, (-1.0, 0.0, 2.0, 0.0, -2.0, 0.0), *scale)
@@ -392,8 +392,8 @@ def _inertia(
     )
 
 
-def _shown(lines: _Lines, rigid: Fit) -> str:
-    """Return up to where a second mass would have shown: its difference to a rigid shaft, in the noise of the lines."""
+def _shown(lines: _Lines, rigid: Fit) -> tuple[str, float]:
+    """Return up to where (Hz) a second mass would have shown: its difference to a rigid shaft, in the lines' noise."""
     penalty = INFORMATION_GAIN + (4 + 2 * len(lines.U)) * math.log(len(rigid.residual))
     power = 2.0 * np.sum(np.abs(lines.U) ** 2, axis=0) / lines.sigma**2
     highest = 0.0
@@ -406,7 +406,7 @@ def _shown(lines: _Lines, rigid: Fit) -> str:
         if float(np.sum(power * change**2)) > penalty:
             highest = float(w_r) / (2.0 * math.pi)
     load = f"a load of {SHOWN_RATIO:g} of the motor's inertia at {100.0 * SHOWN_ZETA:g} % damping"
-    return f"{load} would show up to {highest:.3g} Hz" if highest else f"{load} would not show at any frequency"
+    return f"{load} would " + (f"show up to {highest:.3g} Hz" if highest else "not show at any frequency"), highest
 
 
 def _against(
