@@ -38,13 +38,18 @@ from pmsmtool.identification.calibration import calibrated_traces
 from pmsmtool.identification.cogging import Cogging, cogging_of
 from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
-from pmsmtool.identification.mechanics import NOT_RIGID, of_no_rigid_shaft, pushes_of, with_play_told
+from pmsmtool.identification.mechanics import (
+    NOT_RIGID,
+    of_no_rigid_shaft,
+    pushes_of,
+    unseen_above_hz,
+    with_play_told,
+)
 from pmsmtool.identification.phase_check import PairCheck, check_pairs, check_phases, over_phases
 from pmsmtool.identification.sampling import resistance_as_sampled
 from pmsmtool.identification.wiring import Finding, supply_power, supply_under_load
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
-from pmsmtool.machine.two_masses import SLOWEST_UNSEEN_HZ
 from pmsmtool.plain_text import counted
 from pmsmtool.trace import Trace
 
@@ -291,10 +296,8 @@ def evaluate(
     if pushes is not None and "mechanics" in refused and refused["mechanics"].reason in NOT_RIGID:
         elastic, means, response = of_no_rigid_shaft(pushes, response)
         swing_hz = 0.0 if response is not None and response.found else pushes.swing_hz(response)
-        unseen_hz = 0.0
-        if not swing_hz and (response is None or not response.found):
-            unseen_hz = SLOWEST_UNSEEN_HZ if response is None else max(response.shown_hz, SLOWEST_UNSEEN_HZ)
         errors = {} if elastic is not None else frequency_response.encoder_errors_of(traces, moving)
+        unseen_hz = unseen_above_hz(response, swing_hz)
         moving = replace(
             moving, mechanics=elastic, means=means, encoder_errors=errors, swing_hz=swing_hz, unseen_hz=unseen_hz
         )

@@ -23,6 +23,7 @@ from pmsmtool.estimators.shaft.mechanics import POWERED, MechanicsResult, Torque
 from pmsmtool.estimators.shaft.swing import swing_of
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
+from pmsmtool.machine.two_masses import SLOWEST_UNSEEN_HZ
 from pmsmtool.trace import Trace
 
 if TYPE_CHECKING:
@@ -227,6 +228,13 @@ def of_no_rigid_shaft(
     if found is None:
         return None, means, response
     return replace(found, J=means["J_kgm2"], B=means["B_nms"], tau_c=means["tau_c_nm"]), {}, response
+
+
+def unseen_above_hz(response: FrequencyResponse | None, swing_hz: float) -> float:
+    """Return from where on (Hz) it is not known what swings a shaft that is not rigid; 0 where it is known."""
+    if swing_hz or (response is not None and response.found):
+        return 0.0
+    return max(SLOWEST_UNSEEN_HZ, 0.0 if response is None else response.shown_hz)
 
 
 def _because(means: Mapping[str, Estimate], why: str) -> dict[str, Estimate]:

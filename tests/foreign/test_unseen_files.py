@@ -279,7 +279,7 @@ def test_a_refused_mode_stands_in_no_chains_way(tool: Tool) -> None:
 
 
 @pytest.mark.chain
-def test_a_ramp_that_was_never_set_up_is_named_and_replaced(tool: Tool) -> None:
+def test_a_ramp_that_was_never_set_up_is_named_and_replaced(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
     """0x6083 = 1 count of unknown unit: the demand makes 0.01 rad of 90 degrees until the move is given up."""
     loop: tuple[Row, ...] = (
         (0x6062, 0, "I32", "ro", ""), (0x607A, 0, "I32", "rw", "0"), (0x6081, 0, "U32", "rw", "16384"),
@@ -287,7 +287,9 @@ def test_a_ramp_that_was_never_set_up_is_named_and_replaced(tool: Tool) -> None:
     )  # fmt: skip
     write_eds(Path("x.eds"), unknown("0x2D", *loop))
     move = ("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes", "move", "--by", "90deg", "--speed-max", "500rpm")
-    code, _, said = tool(*move)
+    with monkeypatch.context() as patch:
+        patch.setattr("pmsmtool.experiments.move.LONGEST_S", 2.0)
+        code, _, said = tool(*move)
     assert code == 3 and "a profile that is too slow" in said and "give --speed and --acceleration" in said, said
     code, out, said = tool(*move, "--speed", "100rpm", "--acceleration", "100", "--json")
     assert code == 0 and json.loads(out)["move"]["moving_s"] < 2.0, said

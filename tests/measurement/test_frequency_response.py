@@ -30,6 +30,7 @@ from pmsmtool.identification.mechanics import (
     PLAY_FALLBACK,
     Pushes,
     of_no_rigid_shaft,
+    unseen_above_hz,
     with_play_told,
 )
 from pmsmtool.identification.replay import replay
@@ -280,6 +281,27 @@ def test_pushes_that_a_rigid_shaft_explains_show_play_where_a_small_torque_turns
     assert with_play_told(rigid, response(4.18e-3)).J.fallback.startswith(PLAY_FALLBACK)
     for other in (None, response(5.4e-3), response(7.0e-3)):
         assert with_play_told(rigid, other) is rigid
+
+
+@pytest.mark.parametrize(
+    ("found", "shown_hz", "swing_hz", "unseen_hz"),
+    [
+        (True, 0.0, 0.0, 0.0),
+        (False, 25.8, 0.0, 25.8),
+        (False, 25.8, 140.0, 0.0),
+        (False, 3.0, 0.0, 20.0),
+        (None, 0.0, 0.0, 20.0),
+    ],
+)
+def test_what_swings_a_shaft_unseen_is_told(
+    found: bool | None, shown_hz: float, swing_hz: float, unseen_hz: float
+) -> None:
+    """A gear with 1.1 degrees of play whose response showed nothing was designed as a rigid shaft: over-speed."""
+    nothing = np.zeros(0)
+    seen = {"resonance_hz": Estimate(184.0, 1.0, 0.0, "Hz")} if found else {}
+    response = FrequencyResponse(nothing, nothing.astype(complex), nothing, nothing, 800.0, 1.0, 1.0, 0.0,
+                                 found=seen, shown_hz=shown_hz)  # fmt: skip
+    assert unseen_above_hz(None if found is None else response, swing_hz) == unseen_hz
 
 
 def test_the_inertia_by_a_small_torque_stands_where_pulses_of_few_encoder_steps_leave_it_wide() -> None:
