@@ -120,8 +120,8 @@ class StandardDrive(CanopenDrive):
     def _position_rad(self) -> float:
         """Return the unwrapped mechanical angle; its change over :data:`SPEED_S` and more is the speed.
 
-        An answer may come any time after the drive looked, so that of two looks 1 ms apart the speed is anything: the
-        time counted is that from the older request to the newer answer, which no speed is too large for.
+        An answer may come any time after the drive read its position, so two looks 1 ms apart show any speed. The time
+        counted is that from the older request to the newer answer: the speed is never shown larger than it was.
         """
         clock = self.node.connection.clock
         asked_s, counts, now = clock.now(), self.node.get(POSITION), clock.now()
