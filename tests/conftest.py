@@ -64,7 +64,7 @@ def pytest_collection(session: pytest.Session) -> None:
     for path in sorted(Path(root, "pmsmtool").rglob("*.py"))[first::step]:
         compileall.compile_file(path, quiet=2)
     for path in sorted(Path(root, "tests").rglob("test_*.py"))[first::step]:
-        with contextlib.suppress(Exception, pytest.skip.Exception):  # what is wrong with it is told when it is collected
+        with contextlib.suppress(Exception, pytest.skip.Exception):  # an error is told when it is collected
             import_path(path, mode="importlib", root=root, consider_namespace_packages=False)
 
 
