@@ -55,6 +55,15 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the figures of a report with all their data, but not their SVG text, for chains whose test is not of it.
+
+    What a page draws is tested in ``tests/report``, ``tests/cli/test_report.py`` and by the README's first session.
+    """
+    monkeypatch.setattr("pmsmtool.report.figures.svg", lambda canvas: '<svg xmlns="http://www.w3.org/2000/svg"/>')
+
+
 def pytest_collection(session: pytest.Session) -> None:
     """Begin with another share in every worker: in a new clone each compiled every test and module, for 12 s."""
     worker = getattr(session.config, "workerinput", None)
