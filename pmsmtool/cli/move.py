@@ -178,7 +178,9 @@ def _identified(
     from pmsmtool.identification.move_mechanics import move_mechanics
     from pmsmtool.machine.machine_file import dump_machine_file
 
-    ratios = move_mechanics(trace, pole_pairs=source.machine.pole_pairs, undecided=drive.current_undecided)
+    ratios = move_mechanics(
+        trace, pole_pairs=source.machine.pole_pairs, undecided=drive.current_undecided, rated_apk=drive.rated_apk
+    )
     made = completed_machine(source, ratios, "as given").machine
     assert made is not None
     text = dump_machine_file(made)

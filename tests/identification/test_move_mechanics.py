@@ -64,3 +64,25 @@ def test_one_move_is_not_enough() -> None:
     first = Trace(single.t_s[kept], {k: v[kept] for k, v in single.signals.items()}, single.units, single.meta)
     with pytest.raises(IdentificationError, match="E_EXCITATION"):
         move_mechanics(first, pole_pairs=POLES, undecided=False)
+
+
+def test_moves_too_short_for_their_samples_are_no_torque_pulses() -> None:
+    """90 degrees at an EPOS4's stored ramp, each answer 0.7 ms: the refusal was "0 usable torque pulses, 4 needed"."""
+    slow = moves(4, 1)
+    kept = np.arange(0, len(slow), 12)
+    few = Trace(slow.t_s[kept], {k: v[kept] for k, v in slow.signals.items()}, slow.units, slow.meta)
+    with pytest.raises(IdentificationError, match="0 halves of moves have 60 samples") as refused:
+        move_mechanics(few, pole_pairs=POLES, undecided=False)
+    assert "ms with" in refused.value.what and "--acceleration" in refused.value.hint
+
+
+@pytest.mark.parametrize("phase", [0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+def test_offsets_of_the_current_sensors_are_within_the_interval(phase: float) -> None:
+    """0.2 % of the rated current, which turns with the rotor, where a slow move takes a tenth of it: up to 2.3 %."""
+    plain = moves(4, 3, acceleration=40.0)
+    rated_apk = 4.0
+    offset = 0.002 * rated_apk * np.cos(POLES * plain["theta_m_rad"] + phase)
+    shown = Trace(plain.t_s, {**plain.signals, "i_q_a": plain["i_q_a"] + offset}, plain.units, plain.meta)
+    found = move_mechanics(shown, pole_pairs=POLES, undecided=False, rated_apk=rated_apk)
+    for name, truth in (("J_per_psi", J / PSI), ("tau_c_per_psi", TAU_C / PSI)):
+        assert abs(found[name].value - truth) < total_half_width(found[name])
