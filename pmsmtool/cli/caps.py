@@ -164,6 +164,10 @@ def _lines(found: Capabilities, denied: Mapping[str, str], sources: bool) -> lis
     lacking = [row for row in rows if not row.available and not row.waits_for_person]
     reasons = ((row.quantity, f"by {row.method.value}: needs {', '.join(row.missing)}") for row in lacking)
     lines += [f"not available: {line}" for line in by_reason(reasons, " ")]
+    if found.map_to_write:
+        what = "it moves" if "push" in found.features else "`pmsmtool move` moves it"
+        lines += ["", f"{what} with --map mine.toml: these lines, numbers of its name plate in place of ?"]
+        lines += [f"    {line}" for line in found.map_to_write]
     return lines if found.drive_map.staging else [*lines, *_parameter_lines(found, denied, sources)]
 
 

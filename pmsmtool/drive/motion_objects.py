@@ -21,7 +21,7 @@ from pmsmtool.drive_maps.drive_map import LETTERS
 from pmsmtool.drive_maps.motion_objects import MotionObject
 from pmsmtool.drive_maps.wire_units import wire_unit
 from pmsmtool.errors import NotAvailable, SdoAbort
-from pmsmtool.units import RPM_PER_RAD_S
+from pmsmtool.units import RPM_PER_RAD_S, format_current
 
 ENCODER_COUNTS = DriveObject(0x608F, 1, "I")
 MOTOR_TURNS = DriveObject(0x608F, 2, "I")
@@ -58,6 +58,8 @@ TORQUE_SLOPE = DriveObject(0x6087, 0, "I")
 LENT_SLOPE = 100_000
 """Permille per second that a drive is lent where its own slope is slow: a tenth of the rated torque per ms, as this
 program ramps what has no slope (bench safety: no command rises faster)."""
+LOW_LIMIT = 0.9
+"""Own current limit, of the drive's rated current, below which it is named: it decides what is identified."""
 SLOW_SLOPE_S = 0.5
 """Time to the rated torque from which a slope of the drive's own leaves nothing of a push: the shortest lasts 40 ms. As
 stored, one maker's drive takes 10 s; others take no time (0), or 0.1 ms."""
@@ -187,7 +189,7 @@ def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
         The drive has no such mode, or no target in it.
     """
     modes = int(node.held(objects.SUPPORTED_MODES) or 0)
-    if node.map.capabilities.torque_mode and node.held(objects.TARGET_TORQUE_PERMILLE) is not None:
+    if node.map.capabilities.torque_mode is not False and node.held(objects.TARGET_TORQUE_PERMILLE) is not None:
         order = (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE)
         for mode in reversed(order) if slow_slope_s(node) else order:
             if modes >> mode - 1 & 1:
@@ -350,8 +352,15 @@ def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, floa
 
 
 def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
-    """Return what the drive does not keep by itself, one line each, with what replaces it."""
+    """Return what the drive does not keep by itself, or keeps too well, one line each, with what replaces it."""
     lines = []
+    for limit in current_limits(node, rated):
+        held = allowed(node, iter((limit,)))
+        if held is not None and 0.0 < held[1] < LOW_LIMIT * rated:
+            lines.append(
+                f"current   the drive itself gives {format_current(held[1])}, {100.0 * held[1] / rated:.3g} % of its "
+                f"rated current ({limit}): raise it with the maker's software where the motor may carry more"
+            )
     if allowed(node, current_limits(node, rated)) is None:
         lines.append(
             "current   no limit in the drive (0x6073, 0x6072, or the maker's own): no command asks for more, and this"

@@ -217,8 +217,10 @@ class Capabilities:
 
     Attributes
     ----------
-    torque_mode, velocity_mode : bool
-        CiA 402 modes 4 or 10, and 3 or 9.
+    torque_mode : bool or None
+        CiA 402 modes 4 or 10; None: as the drive says (0x6502).
+    velocity_mode : bool
+        CiA 402 modes 3 or 9, of a simulated drive.
     commutation_angle : bool
         Mode 11 with the commutation angle 0x60EA.
     pdo : bool
@@ -231,7 +233,7 @@ class Capabilities:
         Window averages inside the drive, and a voltage whose acting period is known.
     """
 
-    torque_mode: bool = False
+    torque_mode: bool | None = None
     velocity_mode: bool = False
     commutation_angle: bool = False
     pdo: bool = False

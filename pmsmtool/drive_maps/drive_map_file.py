@@ -374,7 +374,7 @@ def _parse_table(name: str, row: Any, complain: Complain) -> tuple[int, int]:
 
 
 def _parse_capabilities(table: Mapping[str, Any], complain: Callable[[tuple[str, ...], str], None]) -> Capabilities:
-    kinds = {item.name: type(item.default) for item in fields(Capabilities)}
+    kinds = {item.name: bool if item.default is None else type(item.default) for item in fields(Capabilities)}
     good: dict[str, Any] = {}
     for key, value in table.items():
         if key not in kinds:

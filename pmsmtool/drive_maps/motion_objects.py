@@ -7,7 +7,7 @@ is the smaller physical current for a limit or a command, and the larger one for
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -135,6 +135,21 @@ def _object(name: str, row: Mapping[str, Any], tell: Complain) -> MotionObject |
         tell("mode", "a target needs the mode of operation in which it acts, the others none")
         return None
     return MotionObject(row["index"], row["sub"], row["type"], row["unit"], row.get("source", ""), mode)
+
+
+PLATE: Mapping[str, str] = {
+    "rated_current": '{ number = ?, unit = "A rms", source = "plate" }  # or "A peak": which its 0x6071 counts',
+    "counts_per_turn": '{ number = ?, source = "plate" }  # units of 0x6064 per turn of the motor',
+}
+"""Rows that a name plate or a manual fills, as text; what is to be written there is a question mark, no number."""
+
+
+def blank_map(vendor: int, product: int, rows: Iterable[str]) -> list[str]:
+    """Return the lines of a map file that says only whose drive it is for, and asks for numbers of its name plate."""
+    return [
+        'schema = "pmsmtool.drive-map/1"', 'name = "mine"', f"vendor = {vendor:#010x}", f"product = {product:#010x}",
+        f"[{TABLE}]", *(f"{name} = {PLATE[name]}" for name in rows), "[sources]", 'plate = "its name plate"',
+    ]  # fmt: skip
 
 
 def dump_motion(rows: Mapping[str, MotionObject]) -> dict[str, dict[str, Any]]:

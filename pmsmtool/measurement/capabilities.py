@@ -30,7 +30,9 @@ from pmsmtool.drive.motion_objects import (
 from pmsmtool.drive.objects import SUPPORTED_MODES, DriveObject
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.recorders.choice import described
+from pmsmtool.drive.set_point import FOLLOWING_ERROR, POSITION_DEMAND, TARGET_POSITION
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
+from pmsmtool.drive_maps.motion_objects import blank_map
 from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
 from pmsmtool.drive_maps.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
 from pmsmtool.errors import NotAvailable, SdoAbort
@@ -86,6 +88,8 @@ _INJECT = (*_SAFE, "set-points", "excitation", "recorder")
 _RECORD = (*_SAFE, "recorder", "torque mode")
 _BOUNDED = ("supervision", "rated current")
 """What is safe where every command is a current that this program bounds: it replaces limits that the drive lacks."""
+_ON_PLATE = {"rated current": "rated_current", "position": "counts_per_turn"}
+"""What a number of a drive's name plate gives, and the row of a map that takes it."""
 _TURNING = (*_INJECT, "frame")
 _ANGLE = (*_TURNING, "encoder")
 """What every sample of the angle is needed for."""
@@ -255,6 +259,15 @@ class Capabilities:
         return next((row for row in rows if row.available), None)
 
     @property
+    def map_to_write(self) -> tuple[str, ...]:
+        """The map file whose numbers, from the name plate, let a drive move that no map names; else empty."""
+        vendor, product = self.identity.vendor_product
+        lacking = [row for need, row in _ON_PLATE.items() if need not in self.features]
+        moves = "supervision" in self.features and self.features & {"push", "profile position"}
+        unnamed = self.drive_map.name == GENERIC and vendor != UNKNOWN_VENDOR
+        return tuple(blank_map(vendor, product, lacking)) if lacking and moves and unnamed else ()
+
+    @property
     def _always(self) -> tuple[str, ...]:
         """What every motion needs: a reference drive without its own safety is not moved by a lower level either."""
         return _SAFE if self.drive_map.staging else ()
@@ -387,6 +400,9 @@ def _motion(node: DriveNode, rated: float | None) -> dict[str, bool]:
         "current": _told(lambda: shown_current(node, base)) is not None,
         "torque mode": torque,
         "push": torque or _told(lambda: limited_speed(node)) is not None,
+        "profile position": bool(_modes(node) & _bit(Mode.PROFILE_POSITION))
+        and node.held(TARGET_POSITION) is not None
+        and any(node.held(item) is not None for item in (POSITION_DEMAND, FOLLOWING_ERROR)),
     }
 
 

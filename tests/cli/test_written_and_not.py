@@ -48,7 +48,7 @@ def exported(home: Path, into: Path, *more: str) -> int:
     ("product", "head", "said"),
     [
         (0x65510000, "", ""),
-        (0x63220000, "", "product 0x63220000, the map 'epos4' is for 0x61500000, 0x65510000"),
+        (0x63220000, "", "product 0x63220000, the map 'epos4' is for 0x60500000, 0x61500000"),
         (0x65510000, "VendorNumber=0xAB\nProductNumber=0x20B", "vendor 0x000000ab, the map 'epos4' is for 0x000000fb"),
         (0x65510000, "VendorNumber=0\nProductNumber=0", ""),
     ],

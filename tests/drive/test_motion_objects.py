@@ -274,13 +274,15 @@ def test_the_drives_own_trip_is_lowered_with_the_envelope(
 @pytest.mark.parametrize(
     ("held", "told"),
     [
-        ({}, ["current", "speed"]), ({objects.MAX_CURRENT_PERMILLE: 1}, ["speed"]),
+        ({}, ["current", "speed"]), ({objects.MAX_CURRENT_PERMILLE: 900}, ["speed"]),
         ({objects.MAX_SPEED_RPM: 1}, ["current"]),
-        ({motion.MAX_TORQUE_PERMILLE: 1, objects.MAX_SPEED_RPM: 1}, []),
-        ({motion.MAX_TORQUE_PERMILLE: 1, objects.MAX_SPEED_RPM: 1, **SLOW}, ["slope 10 s: raised for the pulses"]),
-        ({motion.MAX_TORQUE_PERMILLE: 1, objects.MAX_SPEED_RPM: 1, **SLOW, objects.SUPPORTED_MODES: 0x200},
+        ({motion.MAX_TORQUE_PERMILLE: 900, objects.MAX_SPEED_RPM: 1}, []),
+        ({motion.MAX_TORQUE_PERMILLE: 900, objects.MAX_SPEED_RPM: 1, **SLOW}, ["slope 10 s: raised for the pulses"]),
+        ({motion.MAX_TORQUE_PERMILLE: 900, objects.MAX_SPEED_RPM: 1, **SLOW, objects.SUPPORTED_MODES: 0x200},
          ["slope 10 s: mode 10 ignores it"]),
-        ({motion.MAX_TORQUE_PERMILLE: 1, objects.MAX_SPEED_RPM: 1, **SLOW, objects.SUPPORTED_MODES: 0x500},
+        ({objects.MAX_CURRENT_PERMILLE: 2000, motion.MAX_TORQUE_PERMILLE: 100, objects.MAX_SPEED_RPM: 1},
+         ["current 1 Apk: 10 % of its rated current (0x6072)"]),
+        ({motion.MAX_TORQUE_PERMILLE: 900, objects.MAX_SPEED_RPM: 1, **SLOW, objects.SUPPORTED_MODES: 0x500},
          ["slope 10 s: raised for the pulses"]),
     ],
 )  # fmt: skip

@@ -177,7 +177,7 @@ def test_only_the_familys_objects_are_there(family: str) -> None:
         for cell in (*drive_map.cells.values(), *drive_map.signals.values()):
             assert len(node.sdo.read(cell.index, cell.sub)) == cell.size
         modes = node.whole(objects.SUPPORTED_MODES)
-        assert bool(modes & 0b1000) == drive_map.capabilities.torque_mode
+        assert bool(modes & 0b1000) == bool(drive_map.capabilities.torque_mode)
         for mode in (-1, 4, 3):
             has = {4: drive_map.capabilities.torque_mode, 3: drive_map.capabilities.velocity_mode}.get(mode, False)
             if has:
