@@ -140,6 +140,7 @@ def _check_below_full(
         envelope.refuse_gravity()
         lines = [
             *envelope.lines(),
+            *found.replaced,
             f"{'a turned vector leads' if turns_a_vector(found) else 'torque pulses turn'} the shaft by at most half a "
             f"turn; {HOMING_LOST}",
             f"capability level {found.level}: what it cannot show is listed as NOT CHECKED",

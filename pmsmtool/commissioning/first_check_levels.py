@@ -28,6 +28,7 @@ from pmsmtool.commissioning.first_check import (
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.motion_objects import rated_apk
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive.torque_drives import TorqueDrive, pushing_drive
 from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, NotAvailable, SdoAbort
@@ -48,7 +49,6 @@ from pmsmtool.identification.wiring import (
     judge_turn,
 )
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.measurement.by_pulses import HEADROOM as PULSES_HEADROOM
 from pmsmtool.measurement.by_pulses import envelope_of
 from pmsmtool.measurement.capabilities import Capabilities
 from pmsmtool.trace import Trace
@@ -69,6 +69,8 @@ KEPT = (0.5, 1.5)
 where peak and rms are taken for each other. With an open phase one of both ways was outside on 11 of 11 drives whose
 current stayed within its limit. Where the push made its whole way, less is a slow current loop (0.28 was seen)."""
 POLE_PAIRS = "motor.pole_pairs"
+ENOUGH_SHARE = 0.9
+"""Least share of that tenth of the rated current under which a healthy shaft moves."""
 
 
 def turns_a_vector(found: Capabilities) -> bool:
@@ -81,7 +83,7 @@ def envelope_below_full(
 ) -> Envelope:
     """Return what the check may do: a tenth of the rated current, half a turn, 15 s; raises as ``envelope_of``."""
     allowed = envelope_of(drive, replace(request, i_max_apk=None), stated)
-    largest = HEADROOM * CURRENT_SHARE * allowed.i_max_apk / PULSES_HEADROOM
+    largest = min(HEADROOM * CURRENT_SHARE * rated_of(drive, stated), allowed.i_max_apk)
     return replace(
         allowed,
         i_max_apk=largest if request.i_max_apk is None else min(request.i_max_apk, largest),
@@ -89,6 +91,11 @@ def envelope_below_full(
         duration_s=DURATION_S,
         travel_rad=TRAVEL_RAD if turns_a_vector(found) else math.pi,
     )
+
+
+def rated_of(drive: CanopenDrive, stated: MachineFile) -> float:
+    """Return the smaller rated current of drive and machine (A peak), whatever the drive's own limit allows of it."""
+    return min(rated_apk(drive.node), stated.machine.I_nom_apk or math.inf)
 
 
 def check_below_full(
@@ -146,7 +153,7 @@ def check_below_full(
                     judged.append(judge_supply(rest_v, turn, stated.inverter.U_dc_v))
             rows = [row for row in rows if row.looked_at not in {each.looked_at for each in judged}] + judged
         except IdentificationError as error:
-            rows.append(Finding("shaft", WRONG, error.what, error.likely + ("; an open phase" if turns else "")))
+            rows.append(unmoved(error, turns, i_a / rated_of(drive, stated)))
         except NotAvailable as refused:  # mode 11: announced in 0x6502, and refused when it is asked for
             if not turns:
                 raise
@@ -163,6 +170,15 @@ def check_below_full(
         drive.may_be_energised = drive.may_be_energised or moving.may_be_energised
         moving.close()
     return _whole(rows, turns)
+
+
+def unmoved(error: IdentificationError, turns: bool, share: float) -> Finding:
+    """Return the row of a shaft that did not move; a share of the rated current below a tenth blames nobody."""
+    likely = error.likely + ("; an open phase" if turns else "")
+    if share > ENOUGH_SHARE * CURRENT_SHARE:
+        return Finding("shaft", WRONG, error.what, likely)
+    seen = f"{error.what}, with {100.0 * share:.2g} % of the rated current: no more is allowed"
+    return Finding("shaft", NOT_SEEN, seen, f"friction, for want of current: see the limits above; {likely}")
 
 
 def beyond(error: LimitExceeded, turns: bool, answer_s: float = 0.0) -> Finding:

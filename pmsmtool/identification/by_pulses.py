@@ -58,8 +58,14 @@ TOO_WIDE = "E_NOT_IDENTIFIABLE"
 """Refusal of ratios whose interval is too wide: the flux linkage beside them stands, and the chain goes on."""
 LEAST_ROWS = math.ceil(BLOCKS / (1.0 - SKIP_SHARE))
 """Readings without which a torque pulse has no block for each speed."""
-LIGHT_SHAFT = "a bare shaft with little inertia: the torque that is safe if the tool fails hardly exceeds friction"
-ADD_INERTIA = "couple an inertia to the shaft and say --shaft coupled, or allow more (--speed-max, --i-max)"
+LIGHT_SHAFT = (
+    "a bare shaft with little inertia, or little current: the torque that is safe if the tool fails hardly exceeds "
+    "friction"
+)
+ADD_INERTIA = (
+    "couple an inertia to the shaft and say --shaft coupled, or allow more (--speed-max, --i-max, the drive's own "
+    "limits)"
+)
 CHECK_WIRING = "switch off and measure the three line-line resistances; `pmsmtool check` looks at the wiring"
 UNDECIDED = "no source says whether this drive's amperes are peak or rms: the interval holds for both"
 Voltage = Literal["machine", "link", ""]
