@@ -38,7 +38,7 @@ from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
 
-pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
+pytestmark = pytest.mark.chain
 
 Pushed = tuple[MappedRecorderDrive, PulseResult, list[Trace]]
 

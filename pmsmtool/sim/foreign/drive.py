@@ -48,8 +48,7 @@ REVISION = 3
 """Sub-index of the identity object that the file gives; vendor and product it may leave blank."""
 PID_MARKS = {(0x30A1, 3), (0x60FB, 3)}
 """Gain of the derivative, by which one controller of the position is known."""
-SERIALS = ((0x1018, 4), (0x2100, 1), (0x6510, 1))
-"""Where makers keep the serial number (EPOS4: 0x2100:01, Copley: 0x6510:01)."""
+SERIAL = (0x1018, 4)
 
 
 class ForeignDrive:
@@ -112,6 +111,7 @@ class ForeignDrive:
             if index in COMMUNICATION and 0x1400 <= index and index not in MAPPINGS:
                 server[index, 1].put(PDO_OFF)  # one that the file lacks
         serial = dictionary["identity.serial"].integer()
+        own_serial = family_of(self.objects).serial
         for (index, sub), row in self.objects.rows.items():
             kept = server.get((index, sub))
             if index < LAST_COMMUNICATION and kept is not None and kept.row.type == row.type:
@@ -127,7 +127,7 @@ class ForeignDrive:
             if law is not None and law.set_up is not None:
                 low, high = row.bounds
                 entry.value = entry.encode(min(max(law.set_up, low), high))  # no more than the drive can give
-            if (index, sub) in SERIALS and entry.code is not None:
+            if (index, sub) in (SERIAL, own_serial) and entry.code is not None:
                 entry.value = entry.encode(serial)
             dictionary.show(entry)
         dictionary.find(0x6502, 0).value = self._modes_word(dictionary)

@@ -46,6 +46,8 @@ class Family:
         Units of position per turn where the maker fixes them; 0: the encoder's counts.
     loop_s : float
         Period of its position loop (s; ``assumed`` where it is a millisecond).
+    serial : tuple of int
+        Where the maker keeps the serial number beside 0x1018:04; empty: nowhere else.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Family:
     speed_source: str = ""
     per_turn: int = 0
     loop_s: float = 1e-3
+    serial: tuple[int, ...] = ()
 
 
 def _current(index: int, sub: int, per_apk: float, source: str) -> Law:
@@ -184,12 +187,14 @@ def _none(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
 
 
 FAMILIES: Sequence[Family] = (
-    Family("EPOS4", ((0x3001, 5), (0x30A0, 1)), _epos4, (0xFB, 0x61500000), 0x0000_0225, loop_s=4e-4),
+    Family(
+        "EPOS4", ((0x3001, 5), (0x30A0, 1)), _epos4, (0xFB, 0x61500000), 0x0000_0225, loop_s=4e-4, serial=(0x2100, 1)
+    ),
     Family(
         "EPOS2", ((0x2030, 0), (0x6410, 5), (0x60F6, 1)), _epos2, (0xFB, 0x63220000), 0x0000_0065, (-3, -2, -1),
         60.0, "rpm: its largest profile velocity is 25000",
     ),
-    Family("Copley", ((0x2110, 0), (0x2111, 0), (0x6410, 34)), _copley, (0xAB, 0x20B)),
+    Family("Copley", ((0x2110, 0), (0x2111, 0), (0x6410, 34)), _copley, (0xAB, 0x20B), serial=(0x6510, 1)),
     Family("Nanotec", ((0x2030, 0), (0x2031, 0), (0x203B, 1)), _nanotec),
     Family(
         "Faulhaber", ((0x2333, 1), (0x2350, 3)), _faulhaber, speed_per_rps=60.0,

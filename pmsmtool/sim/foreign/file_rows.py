@@ -111,9 +111,8 @@ def read_makers_objects(where: str) -> MakersObjects:
     else:
         found, label = dict(_of_eds(data, path)), path.stem
     has_words = {(0x6040, 0), (0x6041, 0)} <= set(found)
+    stated = MakersObjects(label, found, ()).stored(0x1000) & 0xFFFF  # by the file itself
     rows, assumed = _completed(found)
-    profile = MakersObjects(label, rows, assumed)
-    stated = profile.stored(0x1000) & 0xFFFF
     if stated != DRIVE_PROFILE and (stated in PROFILES or not has_words):
         named = f"of a device of profile {stated}" if stated else "of a device without control and status word (0x6040)"
         raise ConfigError(
@@ -122,7 +121,7 @@ def read_makers_objects(where: str) -> MakersObjects:
             likely="a controller of another profile, or a master, which is neither simulated nor moved",
             hint="give the EDS or DCF of a drive",
         )
-    return profile
+    return MakersObjects(label, rows, assumed)
 
 
 def _of_eds(data: bytes, path: Path) -> Iterator[tuple[tuple[int, int], ObjectRow]]:

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: MIT
+"""What files of some 40 makers' devices had, which none of ours had: each in a small file of the tests' own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from pmsmtool.errors import ConfigError
+from pmsmtool.machine.profile import machine_path
+from pmsmtool.sim.foreign.file_rows import read_makers_objects
+from tests.cli.conftest import Tool
+from tests.foreign.data_sheets import Row, epos4, unknown, write_eds
+from tests.foreign.test_foreign_drive import opened
+
+
+def test_a_file_of_no_device_type_and_without_words_is_not_a_drives(tmp_path: Path) -> None:
+    """The mandatory 0x1000 that the simulation adds made a drive of a file with ten objects of every data type."""
+    path = write_eds(tmp_path / "x.eds", [(0x2000, 0, "U32", "rw", "7"), (0x2001, 0, "I16", "ro", "1")])
+    with pytest.raises(ConfigError, match="without control and status word"):
+        read_makers_objects(str(path))
+    path = write_eds(tmp_path / "y.eds", [(0x1000, 0, "U32", "ro", "0x00020192")])
+    assert (0x6040, 0) in read_makers_objects(str(path)).rows
+
+
+def test_an_object_of_another_maker_holds_no_serial_number(tmp_path: Path) -> None:
+    """0x6510:01 is Copley's serial number; of another maker it is the type of the motor, 0 to 9."""
+    rows: tuple[Row, ...] = (*unknown(), (0x6510, 1, "I32", "rw", "3"), (0x2100, 1, "U32", "ro", "5"))
+    with opened(write_eds(tmp_path / "x.eds", rows)) as node:
+        assert node.sdo.read(0x6510, 1, size=4) == (3).to_bytes(4, "little")
+        assert node.sdo.read(0x2100, 1, size=4) == (5).to_bytes(4, "little")
+
+
+def test_the_smallest_epos4_has_its_familys_map(tmp_path: Path, tool: Tool) -> None:
+    write_eds(Path("x.eds"), epos4(product=0x60500000))
+    found = json.loads(tool("caps", "--eds", "x.eds", "--json")[1])
+    assert (found["level"], found["map"]) == ("standard", "epos4")
+
+
+PLATE = """schema = "pmsmtool.drive-map/1"
+name = "mine"
+vendor = 0x000001DD
+product = 0x10305070
+{more}
+[motion]
+rated_current = {{ number = 6.08, unit = "A peak", source = "plate" }}
+[sources]
+plate = "name plate"
+"""
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("without", [(0x6075,), (0x608F,), (0x6075, 0x608F)])
+def test_caps_prints_the_map_that_a_drive_without_numbers_needs(tool: Tool, without: tuple[int, ...]) -> None:
+    write_eds(Path("x.eds"), unknown("0x225", without=without))
+    _, printed, _ = tool("caps", "--eds", "x.eds")
+    lines = [line.strip() for line in printed.splitlines() if line.startswith("    ")]
+    text = "\n".join(lines[lines.index('schema = "pmsmtool.drive-map/1"') :])
+    Path("mine.toml").write_text(text, encoding="utf-8")
+    assert tool("caps", "--eds", "x.eds", "--map", "mine.toml")[0] == 2  # a question mark is no number
+    Path("mine.toml").write_text(text.replace("?", "4096"), encoding="utf-8")
+    found = json.loads(tool("caps", "--eds", "x.eds", "--map", "mine.toml", "--json")[1])
+    assert found["level"] == "standard", found["quantities"]
+
+
+def test_a_drive_that_moves_by_position_alone_is_told_the_map_for_that(tool: Tool) -> None:
+    move: tuple[Row, ...] = ((0x607A, 0, "I32", "rw", "0"), (0x60F4, 0, "I32", "ro", ""))
+    write_eds(Path("x.eds"), unknown("0x1", *move, without=(0x608F,)))
+    assert "`pmsmtool move` moves it with --map mine.toml" in tool("caps", "--eds", "x.eds")[1]
+
+
+def test_caps_prints_no_map_that_would_move_nothing(tool: Tool) -> None:
+    """Velocity mode alone, a maker who names no vendor, no supervision: numbers of a name plate would not help."""
+    for rows in (unknown("0x5", without=(0x6075,)), unknown(without=(0x6075, 0x1016)),
+                 unknown("0x225", (0x1018, 1, "U32", "ro", "0"), without=(0x6075,))):  # fmt: skip
+        write_eds(Path("x.eds"), rows)
+        assert "mine.toml" not in tool("caps", "--eds", "x.eds")[1]
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize(("more", "code"), [("", 10), ("[capabilities]\ntorque_mode = false", 9)])
+def test_a_map_with_the_name_plates_number_alone_moves_a_drive(tool: Tool, more: str, code: int) -> None:
+    """Without [capabilities] in the map, a drive that announces modes 4 and 10 "needed torque mode (0x6502 bit 3)"."""
+    write_eds(Path("x.eds"), unknown("0x225", without=(0x6075,)))
+    Path("mine.toml").write_text(PLATE.format(more=more), encoding="utf-8")
+    drive = ("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--map", "mine.toml", "--yes")
+    ended, _, said = tool("check", str(machine_path("interior-2k2")), *drive)
+    assert ended == code, said
+
+
+@pytest.mark.chain
+def test_a_drive_that_gives_a_tenth_of_its_current_is_no_wrong_wiring(tool: Tool) -> None:
+    """0x6072 = 100 permille as stored: `check` tried a hundredth of the rated current, and named a shut brake."""
+    write_eds(Path("x.eds"), unknown("0x2D", (0x6072, 0, "U16", "rw", "100")))
+    drive = ("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes")
+    code, printed, said = tool("check", str(machine_path("interior-2k2")), *drive, "--json")
+    assert code == 10 and {row["looked_at"]: row["verdict"] for row in json.loads(printed)["findings"]}["shaft"] == "ok"
+    assert "10 % of its rated current (0x6072)" in said, said
+    code, printed, said = tool("check", str(machine_path("interior-2k2")), *drive, "--i-max", "0.1Apk", "--json")
+    (row,) = (row for row in json.loads(printed)["findings"] if row["looked_at"] == "shaft")
+    assert code == 10 and row["verdict"] == "not seen" and "0.82 % of the rated current" in row["shown"], row
