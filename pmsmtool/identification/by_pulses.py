@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
+
+import numpy as np
 
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
@@ -62,6 +64,12 @@ LIGHT_SHAFT = (
     "a bare shaft with little inertia, or little current: the torque that is safe if the tool fails hardly exceeds "
     "friction"
 )
+LATE_CURRENT = (
+    "loops of the drive that bring its current up too slowly: {:.0f} % of what was asked for flowed in the second half "
+    "of the torque pulses"
+)
+ARRIVED = 0.5
+"""Share of the current asked for below which that is the cause: 0.2 where J came out negative, 0.9 and more else."""
 ADD_INERTIA = (
     "couple an inertia to the shaft and say --shaft coupled, or allow more (--speed-max, --i-max, the drive's own "
     "limits)"
@@ -69,6 +77,13 @@ ADD_INERTIA = (
 CHECK_WIRING = "switch off and measure the three line-line resistances; `pmsmtool check` looks at the wiring"
 UNDECIDED = "no source says whether this drive's amperes are peak or rms: the interval holds for both"
 Voltage = Literal["machine", "link", ""]
+
+
+def current_share(pushes: Sequence[Trace]) -> float:
+    """Return what of the current asked for flowed in the second half of the pulses, their median; 1 where none says."""
+    asked = [(push, float(push.meta.get("i_command_a", 0.0))) for push in pushes]
+    shares = [float(np.mean(push["i_q_a"][len(push) // 2 :])) / command for push, command in asked if command]
+    return float(np.median(shares)) if shares else 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,8 +261,10 @@ def _by_torque(
         if error.reason != TOO_WIDE:
             raise
         what = error.what.removeprefix(f"{TOO_WIDE}: ")
-        too_wide = IdentificationError(TOO_WIDE, what, where=error.where, likely=LIGHT_SHAFT, hint=ADD_INERTIA)
-        missing["J_per_psi"] = f"{error.what} (likely {LIGHT_SHAFT})"
+        flowed = current_share(pushes)
+        likely = LIGHT_SHAFT if flowed >= ARRIVED else LATE_CURRENT.format(100.0 * flowed)
+        too_wide = IdentificationError(TOO_WIDE, what, where=error.where, likely=likely, hint=ADD_INERTIA)
+        missing["J_per_psi"] = f"{error.what} (likely {likely})"
     if facts.current_undecided:
         estimates = {name: either_reading(estimate) for name, estimate in estimates.items()}
     if not pole_pairs:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from pmsmtool.errors import IdentificationError
@@ -16,6 +17,7 @@ from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.trace import Trace
 
 ASKED = ("R", "L", "psi", "mechanics")
 SHEET = "as given"
@@ -71,6 +73,25 @@ def test_an_inertia_that_is_too_wide_leaves_the_flux_linkage(monkeypatch: pytest
     assert set(result.estimates) == {"psi_f_wb"} and result.missing["J_per_psi"].startswith("E_NOT_IDENTIFIABLE: J/psi")
     refused = judged(result.estimates, result.missing, ("mechanics",), None).verdicts.refused["mechanics"]
     assert refused.startswith("E_NOT_IDENTIFIABLE"), "the reason stands once"
+
+
+@pytest.mark.parametrize(("share", "named"), [(0.13, "13 % of what was asked for flowed"), (0.95, "bare shaft")])
+def test_a_current_that_comes_too_late_is_the_reason(monkeypatch: pytest.MonkeyPatch, share: float, named: str) -> None:
+    """In the velocity mode of a simulated drive 13 % of the current flowed, and J/psi came out negative."""
+
+    def too_wide(*args: object, **options: object) -> dict[str, Estimate]:
+        raise IdentificationError("E_NOT_IDENTIFIABLE", "J/psi is wide")
+
+    monkeypatch.setattr(by_pulses, "estimate_ratios", too_wide)
+    monkeypatch.setattr(by_pulses, "judge_pulses", lambda pushes: [])
+    t, units = 0.001 * np.arange(40), {"i_q_a": "A", "theta_M_rad": "rad"}
+    pushes = {
+        f"torque_push_{k}": Trace(t, {"i_q_a": np.full(40, share * i_a), "theta_M_rad": t}, units, {"i_command_a": i_a})
+        for k, i_a in enumerate((2.0, -2.0, 2.0, -2.0))
+    }
+    with pytest.raises(IdentificationError) as caught:
+        pulse_result(pushes, PulseFacts(Method.STANDARD, pole_pairs=7, pushed=True))
+    assert named in caught.value.likely
 
 
 def test_a_useless_value_is_refused_alone_and_the_others_are_kept(known: MachineFile) -> None:
