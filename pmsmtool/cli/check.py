@@ -123,7 +123,7 @@ def _check_below_full(
     if found.level not in (CapabilityLevel.STANDARD, CapabilityLevel.RECORDER) or missing:
         raise NotAvailable(
             f"nothing can be moved on this drive: it needs {', '.join(missing) or 'objects of CiA 402'}",
-            where=f"node {found.identity.node}", hint="`pmsmtool caps` lists what it can measure",
+            where=f"node {found.identity.node}", hint=f"`pmsmtool caps` lists what it can measure{found.by_moves}",
         )  # fmt: skip
     if path is None:
         raise ConfigError(

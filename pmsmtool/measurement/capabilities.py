@@ -259,6 +259,12 @@ class Capabilities:
         return next((row for row in rows if row.available), None)
 
     @property
+    def by_moves(self) -> str:
+        """What leads on where a drive is not pushed, but moves by its position loop; else empty."""
+        moves = self.features >= {*_BOUNDED, "position", "profile position"} and "push" not in self.features
+        return "; `pmsmtool move --identify` finds inertia and friction by moves" if moves else ""
+
+    @property
     def map_to_write(self) -> tuple[str, ...]:
         """The map file whose numbers, from the name plate, let a drive move that no map names; else empty."""
         vendor, product = self.identity.vendor_product
@@ -286,7 +292,8 @@ class Capabilities:
         raise NotAvailable(
             "\n  - ".join(["this drive cannot measure what was asked for", *self._reasons(quantities, method)]),
             where=f"node {self.identity.node}",
-            hint="`pmsmtool caps` lists what it can; `pmsmtool machine new` takes numbers of a datasheet or a meter",
+            hint=f"`pmsmtool caps` lists what it can{self.by_moves}; `pmsmtool machine new` takes numbers of a "
+            "datasheet or a meter",
         )
 
     def _reasons(self, quantities: Sequence[str], method: Method | None) -> list[str]:

@@ -66,8 +66,7 @@ def test_caps_prints_the_map_that_a_drive_without_numbers_needs(tool: Tool, with
 
 
 def test_a_drive_that_moves_by_position_alone_is_told_the_map_for_that(tool: Tool) -> None:
-    move: tuple[Row, ...] = ((0x607A, 0, "I32", "rw", "0"), (0x60F4, 0, "I32", "ro", ""))
-    write_eds(Path("x.eds"), unknown("0x1", *move, without=(0x608F,)))
+    write_eds(Path("x.eds"), unknown("0x1", *MOVE, without=(0x608F,)))
     assert "`pmsmtool move` moves it with --map mine.toml" in tool("caps", "--eds", "x.eds")[1]
 
 
@@ -101,3 +100,15 @@ def test_a_drive_that_gives_a_tenth_of_its_current_is_no_wrong_wiring(tool: Tool
     code, printed, said = tool("check", str(machine_path("interior-2k2")), *drive, "--i-max", "0.1Apk", "--json")
     (row,) = (row for row in json.loads(printed)["findings"] if row["looked_at"] == "shaft")
     assert code == 10 and row["verdict"] == "not seen" and "0.82 % of the rated current" in row["shown"], row
+
+
+MOVE: tuple[Row, ...] = ((0x607A, 0, "I32", "rw", "0"), (0x60F4, 0, "I32", "ro", ""))
+
+
+@pytest.mark.parametrize(("rows", "told"), [(unknown("0x1", *MOVE), True), (unknown("0x1"), False)])
+def test_a_drive_without_torque_mode_is_led_to_moves(tool: Tool, rows: tuple[Row, ...], told: bool) -> None:
+    write_eds(Path("x.eds"), rows)
+    drive = ("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes")
+    for command in (("check", str(machine_path("interior-2k2"))), ("identify", "mechanics")):
+        code, _, said = tool(*command, *drive)
+        assert code == 9 and ("`pmsmtool move --identify` finds inertia" in said) == told, said
