@@ -33,7 +33,7 @@ from tests.firmware.closed_loop import DEFAULTS, MODE_CURRENT, MODE_SPEED, MODE_
 POISON = (math.nan, math.inf, -math.inf, 1e30, -1e30, 1e-41)
 SAMPLED = ("i_a", "i_b", "i_c", "theta_e", "omega_e", "U_dc", "T_winding")
 ASKED = ("i_d_ref", "i_q_ref", "tau_ref", "omega_M_ref", "u_d_inject", "u_q_inject", "bias_bandwidth")
-TABLE = "table"
+TABLE, NODES = "table", "saturation"
 LAWS: dict[str, dict[str, float]] = {
     "pi": {},
     "pi, clip": {"current.options": 3},
@@ -51,6 +51,11 @@ LAWS: dict[str, dict[str, float]] = {
     "governor 3, minimum time": {"governor.mode": 3, "governor.options": 28},
     "governor 3, hexagon": {"governor.mode": 3, "governor.options": 31, "current.options": 23},
     **{f"polar {mode}": {"polar.mode": mode} for mode in range(1, 7)},
+    "saturated, pi": {},
+    "saturated, pi, predictor": {"current.options": 23},
+    "saturated, line": {"governor.mode": 2, "governor.options": 12},
+    "saturated, best": {"governor.mode": 3, "governor.options": 28},
+    "saturated, best, predictor": {"governor.mode": 3, "governor.options": 30, "current.options": 23},
 }
 """Values of the catalogue that choose a law. The predictor's bit is 4 of the current options, 2 of the governor's."""
 WEAKENING = (0, 1, 2, 3, 4)
@@ -99,6 +104,20 @@ def table_of(values: dict[str, float], rng: np.random.Generator) -> tuple[dict[s
     return {"lut.format": 1, "lut.axis_kind": 0, "lut.n_x": 7, "lut.n_y": 5, "lut.n_z": 1}, words
 
 
+def saturation_of(values: dict[str, float], rng: np.random.Generator) -> tuple[dict[str, float], bytes]:
+    """Return descriptor and words of a saturation table; the inductances fall by up to a quarter at I_max."""
+    I_max, n, falls = values["motor.I_max_apk"], 5, rng.uniform(0.05, 0.25)
+    i_d, i_q = np.meshgrid(np.linspace(-1.1, 0.5, n) * I_max, np.linspace(0.0, 1.1, n) * I_max, indexing="ij")
+    share = 1.0 - falls * np.minimum(1.0, (i_d**2 + i_q**2) / I_max**2)
+    L_d, L_q = values["motor.L_d_h"] * share, values["motor.L_q_h"] * share
+    nodes = np.stack([values["motor.psi_f_wb"] + L_d * i_d, L_q, L_d, L_q], axis=-1)
+    descriptor = {
+        "saturation.n_d": n, "saturation.n_q": n, "saturation.i_d_min_a": -1.1 * I_max,
+        "saturation.i_d_max_a": 0.5 * I_max, "saturation.i_q_max_a": 1.1 * I_max,
+    }  # fmt: skip
+    return descriptor, nodes.astype(np.float32).tobytes()
+
+
 class Case:
     """A drawn machine under one law, in one mode, at a constant speed."""
 
@@ -111,6 +130,11 @@ class Case:
         if weakening == 1:
             chosen, lut = table_of(values, rng)
             values |= chosen
+        self.words = {TABLE: (0, len(lut) // 4)}
+        if law.startswith("saturated"):
+            chosen, nodes = saturation_of(values, rng)
+            self.words[NODES] = (len(lut) // 4, (len(lut) + len(nodes)) // 4)
+            values, lut = values | chosen, lut + nodes
         omega = rng.uniform(-1.2, 1.2) * 0.6 * values["inverter.U_dc_nom_v"] / math.sqrt(3.0) / values["motor.psi_f_wb"]
         self.loop = Loop(core(), values, omega=omega, U_dc=values["inverter.U_dc_nom_v"], lut=lut)
         self.asked = {
@@ -121,7 +145,7 @@ class Case:
             "bias_bandwidth": float(rng.choice([0.0, 0.0, 0.0, 100.0])),
         }
         self.V_max = values["inverter.voltage_utilisation"] * self.loop.U_dc
-        self.inputs = [*SAMPLED, *ASKED, *([TABLE] if lut else [])]
+        self.inputs = [*SAMPLED, *ASKED, *(name for name, (first, end) in self.words.items() if end > first)]
 
     def flux(self, i: np.ndarray) -> float:
         """Return the flux of a current (A) over what V_max changes in a period."""
@@ -138,7 +162,7 @@ class Case:
         m.i_a, m.i_b, m.i_c = loop.plant.phases()
         m.theta_e, m.omega_e = loop.plant.theta, loop.plant.omega
         T, kept = m.T_winding, None
-        if name == TABLE:
+        if name in self.words:
             assert loop.lut is not None
             kept = loop.lut[word]
             loop.lut[word] = int(np.float32(value).view(np.uint32))
@@ -173,7 +197,7 @@ def restore(loop: Loop, kept: tuple[bytes, np.ndarray, np.ndarray, float]) -> No
 
 def is_number(name: str, value: float) -> bool:
     """Whether the core may take it: a denormal is a small number (but as a bandwidth), no temperature is no sensor."""
-    if name == TABLE or (name == "T_winding" and math.isnan(value)):
+    if name in (TABLE, NODES) or (name == "T_winding" and math.isnan(value)):
         return True
     return abs(value) < 1.0 and name != "bias_bandwidth"
 
@@ -190,7 +214,7 @@ def episode(case: Case, rng: np.random.Generator, found: Counter[str]) -> float:
         case.good()
     before, start = voltage(loop.output), copy_of(loop)
     count, name = (2 if rng.uniform() < 0.2 else 1), str(rng.choice(case.inputs))
-    value, word = float(rng.choice(POISON)), int(rng.integers(len(loop.lut))) if loop.lut else 0
+    value, word = float(rng.choice(POISON)), int(rng.integers(*case.words.get(name, (0, 1))))
     for _ in range(count + 2):
         case.good()
     twin = loop.plant.i.copy()
@@ -219,7 +243,7 @@ def episode(case: Case, rng: np.random.Generator, found: Counter[str]) -> float:
         case.good()
         found["no number with gates on"] += int(not np.isfinite(duties(loop.output)).all())
     away = case.flux(loop.plant.i - twin)
-    if usable or case.law in NOT_TUNED or case.flux(twin - start[1]) > QUIET:
+    if (usable and (name != NODES or abs(value) < 1.0)) or case.law in NOT_TUNED or case.flux(twin - start[1]) > QUIET:
         return 0.0
     found["judged by the twin"] += 1
     found["not back"] += int(not away <= AWAY or loop.output.gates == 0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -60,6 +61,14 @@ def clamp(x: np.float32, low: np.float32, high: np.float32) -> np.float32:
     return low if x < low else min(x, high)
 
 
+class Node(NamedTuple):
+    """A node of the torque axis: mean current of its corners that hold a point, and whether one holds none."""
+
+    i: Vector
+    weight: np.float32
+    hole: bool
+
+
 @dataclass
 class Twin:
     """Current control of one drive; ``values`` is a catalogue mapping, look-up tables are plain arrays."""
@@ -70,6 +79,10 @@ class Twin:
     x: list[np.float32] = field(default_factory=lambda: [f(0), f(0)])
     flags: int = 0
     held_q: np.float32 = field(default_factory=lambda: f(0))
+    cut_node: int | None = None
+    U_slow: np.float32 = field(default_factory=lambda: f(0))
+    power: np.float32 = field(default_factory=lambda: f(0))
+    places: tuple[tuple[int, np.float32], tuple[int, np.float32]] = ((0, f(0)), (0, f(0)))
 
     def __getitem__(self, name: str) -> np.float32:
         return f(self.values[name])
@@ -95,6 +108,13 @@ class Twin:
         k = int(np.searchsorted(axis, x, side="right")) - 1
         return k, (x - axis[k]) / (axis[k + 1] - axis[k])
 
+    def link_ahead(self, U_dc: np.float32) -> np.float32:
+        """Link voltage that a falling link is going to have."""
+        weight = min(f(self.values["inverter.T_s_ns"]) * f(1e-9) * f(500), f(1))
+        self.U_slow = self.U_slow + weight * (U_dc - self.U_slow) if self.U_slow > 0 else U_dc
+        fall = U_dc - self.U_slow
+        return U_dc + fall if fall < 0 and U_dc > -fall else U_dc
+
     def equivalent_rpm(self, rpm: np.float32, U_dc: np.float32) -> np.float32:
         if len(self.axes[2]) > 1 or U_dc == self.axes[2][0]:
             return rpm
@@ -113,70 +133,133 @@ class Twin:
         omega = abs(omega_e)
         return top if omega * top <= V_m else V_m / omega
 
+    def node(self, k: int) -> Node:
+        """One node of the torque axis at the speed and link that are placed."""
+        y, z = self.places
+        total, weight, hole = [f(0), f(0)], f(0), False
+        for right_z in (0, 1) if z[1] > 0 else (0,):
+            for right_y in (0, 1):
+                w = (y[1] if right_y else f(1) - y[1]) * (z[1] if right_z else f(1) - z[1])
+                if w == 0:
+                    continue
+                corner = [table[k, y[0] + right_y, z[0] + right_z] for table in self.tables]
+                if np.isnan(corner).any():
+                    hole = True
+                    continue
+                total = [t + w * c for t, c in zip(total, corner, strict=True)]
+                weight = weight + w
+        if hole and weight > 0:
+            total = [t / weight for t in total]
+        return Node((total[0], total[1]), weight, hole)
+
+    def within(self, node: Node) -> bool:
+        return bool(node.weight > 0 and node.i[0] * node.i[0] + node.i[1] * node.i[1] <= self.power)
+
+    def way_out(self, inside: Vector, outside: Node) -> Vector:
+        """Where the way between two points leaves the circle of the limit."""
+        if not outside.weight > 0:
+            return inside
+        way = outside.i[0] - inside[0], outside.i[1] - inside[1]
+        a, b = way[0] * way[0] + way[1] * way[1], inside[0] * way[0] + inside[1] * way[1]
+        c = (inside[0] * inside[0] + inside[1] * inside[1]) - self.power
+        root = np.sqrt(b * b - a * c)
+        share = -c / (b + root) if b > 0 else (root - b) / a if a > 0 else f(0)
+        return inside[0] + share * way[0], inside[1] + share * way[1]
+
+    def on_way(self, k: int, x: np.float32) -> bool:
+        axis = self.axes[0]
+        return bool(0 <= k < len(axis) and axis[k] * x >= 0 and abs(axis[k]) <= abs(x))
+
+    def cut_as_before(self, x: np.float32) -> Vector | None:
+        """Where the torque was cut in the last period, or one node beside it."""
+        low, step = self.cut_node, -1 if x < 0 else 1
+        if low is None or not self.on_way(low, x) or not self.on_way(low + step, x):
+            return None
+        first = self.node(low)
+        if not self.within(first):
+            if self.axes[0][low] == 0 and first.weight > 0:
+                return first.i
+            low, beyond = low - step, first
+            if not self.on_way(low, x):
+                return None
+            first = self.node(low)
+        else:
+            beyond = self.node(low + step)
+            if self.within(beyond):
+                low, first = low + step, beyond
+                if not self.on_way(low + step, x):
+                    return None
+                beyond = self.node(low + step)
+        if not self.within(first) or self.within(beyond):
+            return None
+        self.cut_node = low
+        return self.way_out(first.i, beyond)
+
+    def cut(self, x: np.float32, k: int, near: Node, far: Node) -> Vector:
+        axis, low, high, inside, outside = self.axes[0], k, k + (-1 if x < 0 else 1), near, far
+        if not self.within(near):
+            outside, high, low, known = near, k, len(axis) - 1 if x < 0 else 0, False
+            while abs(high - low) > 1:
+                middle = (low + high) // 2
+                if axis[middle] * x <= 0:
+                    low = middle
+                elif self.within(node := self.node(middle)):
+                    low, inside, known = middle, node, True
+                else:
+                    high, outside = middle, node
+            if not known and low != high:
+                inside = self.node(low)
+        if axis[low] * x < 0:
+            share = axis[low] / (axis[low] - axis[high])
+            i = (
+                inside.i[0] + share * (outside.i[0] - inside.i[0]),
+                inside.i[1] + share * (outside.i[1] - inside.i[1]),
+            )
+            inside = Node(i, inside.weight, inside.hole)
+        self.cut_node = low
+        if not inside.weight > 0:
+            return self["field_weakening.i_d_min_a"], inside.i[1]
+        return self.way_out(inside.i, outside) if self.within(inside) else inside.i
+
     def lookup(self, tau: np.float32, omega_M: np.float32, omega_e: np.float32, U_dc: np.float32) -> Vector:
+        """Currents of a torque, cut where they exceed the limit."""
+        U_dc = self.link_ahead(U_dc)
         y = self.second_coordinate(omega_M, omega_e, U_dc)
         sign = f(1)
         if omega_M < 0 and self.axes[1][0] >= 0:
             sign, y = f(-1), abs(y)
         if self.axes[0][0] >= 0:
             sign = f(-1) if tau < 0 else f(1)
-        places = [self.find(axis, v) for axis, v in zip(self.axes, (sign * tau, y, U_dc), strict=True)]
-        total, weight, hole = [f(0), f(0)], f(0), False
-        for k in range(8):
-            right = (k >> 2, (k >> 1) & 1, k & 1)
-            if right[2] and len(self.axes[2]) < 2:
-                continue
-            w = [place[1] if r else f(1) - place[1] for place, r in zip(places, right, strict=True)]
-            product = (w[0] * w[1]) * w[2]
-            if product == 0:
-                continue
-            cell = tuple(place[0] + r for place, r in zip(places, right, strict=True))
-            corner = [table[cell] for table in self.tables]
-            if np.isnan(corner).any():
-                hole = True
-                continue
-            total = [t + product * c for t, c in zip(total, corner, strict=True)]
-            weight = weight + product
-        self.flags |= 16 if hole else 0
-        if weight == 0:
-            return self["field_weakening.i_d_min_a"], f(0)
-        if hole:
-            total = [t / weight for t in total]
-        return total[0], sign * total[1]
-
-    def lookup_within_limit(self, tau: np.float32, *rest: np.float32) -> Vector:
-        """Cut the torque until the table's current keeps the limit."""
-        power = self["motor.I_max_apk"] * self["motor.I_max_apk"]
-
-        def size(i: Vector) -> np.float32:
-            return i[0] * i[0] + i[1] * i[1]
-
-        def way_out() -> np.float32:
-            way = outside[0] - inside[0], outside[1] - inside[1]
-            a, b, c = size(way), inside[0] * way[0] + inside[1] * way[1], size(inside) - power
-            root = np.sqrt(b * b - a * c)
-            return -c / (b + root) if b > 0 else (root - b) / a
-
-        outside = self.lookup(tau, *rest)
-        if size(outside) <= power:
-            return outside
+        self.places = self.find(self.axes[1], y), self.find(self.axes[2], U_dc)
+        self.power = self["motor.I_max_apk"] * self["motor.I_max_apk"]
+        axis, x = self.axes[0], sign * tau
+        i = self.cut_as_before(x)
+        if i is not None:
+            self.flags |= 4 | (8 if x < axis[0] or x > axis[-1] else 0)
+            return i[0], sign * i[1]
+        k, weight = self.find(axis, x)
+        left, right = self.node(k), self.node(k + 1)
         flags = self.flags | 4
-        inside, low, high = self.lookup(f(0), *rest), f(0), tau
-        if size(inside) < power:
-            for _ in range(2):
-                middle = low + way_out() * (high - low)
-                i = self.lookup(middle, *rest)
-                if size(i) < power:
-                    inside, low = i, middle
-                else:
-                    outside, high = i, middle
-            share = way_out()
-            inside = (inside[0] + share * (outside[0] - inside[0]), inside[1] + share * (outside[1] - inside[1]))
-        self.flags = flags
-        return inside
+        i = self.between(left, right, weight)
+        self.cut_node = None
+        if i[0] * i[0] + i[1] * i[1] > self.power:
+            i = self.cut(x, k + 1, right, left) if x < 0 else self.cut(x, k, left, right)
+            self.flags = flags
+        return i[0], sign * i[1]
+
+    def between(self, left: Node, right: Node, weight: np.float32) -> Vector:
+        a, b = f(1) - weight, weight
+        if (left.hole and a > 0) or (right.hole and b > 0):
+            self.flags |= 16
+            a, b = a * left.weight, b * right.weight
+            if not a + b > 0:
+                return self["field_weakening.i_d_min_a"], f(0)
+            scale = f(1) / (a + b)
+            a, b = a * scale, b * scale
+        return a * left.i[0] + b * right.i[0], a * left.i[1] + b * right.i[1]
 
     def torque_to_current(self, tau: np.float32, omega_M: np.float32, omega_e: np.float32, U_dc: np.float32) -> Vector:
-        i = self.lookup_within_limit(tau, omega_M, omega_e, U_dc)
+        i = self.lookup(tau, omega_M, omega_e, U_dc)
         if i[0] < self["field_weakening.i_d_min_a"]:
             self.flags |= 4
             i = self["field_weakening.i_d_min_a"], i[1]

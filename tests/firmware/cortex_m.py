@@ -207,7 +207,7 @@ def weight(code: bytes) -> int:
     if is_vfp(first, second):
         divide = first & 0xFFB0 == 0xEE80 and not second & 0x40
         root = first & 0xFFBF == 0xEEB1 and second & 0x00C0 == 0x00C0
-        fused = first & 0xFFA0 in (0xEEA0, 0xEE00) and not second & 0x10
+        fused = first & 0xFFB0 in (0xEE00, 0xEE10, 0xEE90, 0xEEA0) and not second & 0x10
         return 14 if divide or root else 3 if fused else 1
     if first & 0xFE00 == 0xEC00:  # load and store of floating-point registers
         single = first & 0x0120 == 0x0100

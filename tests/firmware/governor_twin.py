@@ -6,7 +6,7 @@ One operation at a time in the core's order, so that the governed reference can 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from tests.firmware.projection_twin import (
     ZERO,
     Row,
     find_corner,
+    project_pair,
     project_row,
     project_row_from,
     project_rows,
@@ -58,6 +59,7 @@ class GovernedTwin(Twin):
     multiplier: np.float32 = ZERO
     corner: Vector = (ZERO, ZERO)
     cornered: int = 0
+    projected: bool = False
     omega: np.float32 = ZERO
     T_s: np.float32 = ZERO
     V_max: np.float32 = ZERO
@@ -187,6 +189,9 @@ class GovernedTwin(Twin):
         if int(self.values["governor.mode"]) == LINE:
             return self.line_search(rows, steady, r)
         found = project_rows(rows[: steady + 1], r)
+        if found is not None and self.projected and len(rows) > steady + 1:
+            v, basis = found
+            return (self.slide(rows, r, v) if basis[1] == NONE else v), basis[0]
         more = None if found is None else project_rows(rows, r, found)
         self.flags |= FLAG_FALLBACK if more is None else 0
         if found is None:
@@ -222,14 +227,40 @@ class GovernedTwin(Twin):
             return v, True
         if kept is not None and self.time_to_go <= 0:
             return kept, True
-        both = project_rows([pre, rows[-1]], r, (v, [0 if v != r else NONE, NONE]))
-        v = v if both is None else both[0]
-        self.reachable = v
+        self.reachable = v = self.meet_both(pre, rows[-1], r, v)
         return v, False
+
+    @staticmethod
+    def slide(rows: list[Row], r: Vector, v: Vector) -> Vector:
+        """The corner of row 0 and current row beside a point of row 0 that is outside the other."""
+        now, last = rows[0], replace(rows[-1], V=rows[-1].V * f(1.02))
+        limit, power = last.V * last.V, square(v)
+        if power <= limit:
+            return v
+        share = last.V / np.sqrt(power)
+        corner, _ = find_corner(now, last, r, (share * v[0], share * v[1]), 3)
+        margin = f(1.0001)
+        within = square(corner) <= margin * limit and square(now.voltage(corner)) <= margin * now.V * now.V
+        return corner if within else v
+
+    @staticmethod
+    def meet_both(row: Row, circle: Row, r: Vector, v: Vector) -> Vector:
+        """The nearest point inside a row and the circle, which v, nearest on the row alone, is not."""
+        power, outside = square(r), v
+        inside = power <= circle.V * circle.V
+        if not inside:
+            share = circle.V / np.sqrt(power)
+            outside = share * r[0], share * r[1]
+            if square(row.voltage(outside)) <= row.V * row.V:
+                return outside
+        first, second = (row, circle) if inside else (circle, row)
+        corner = project_pair(first, second, r, outside)
+        return v if corner is None else corner
 
     def govern(self, request: Vector) -> Vector:
         options, r, may_start = int(self.values["governor.options"]), request, True
         rows, steady, offset = self.rows()
+        self.projected = bool(options & PRE_PROJECTION) and int(self.values["governor.mode"]) != LINE
         if options & PRE_PROJECTION:
             if int(self.values["governor.mode"]) == LINE:
                 r = self.approach(rows, steady, r)
@@ -271,21 +302,22 @@ class GovernedTwin(Twin):
 
     def steer(self, rows: list[Row], steady: int, offset: Vector, r: Vector, may_start: bool) -> Vector:
         last = rows[steady]
-        v = smallest_voltage(last, rows[0])
-        empty = bool(square(last.voltage(v)) > EMPTY_MARGIN * last.V * last.V)
-        self.binding = EMPTY
-        self.flags |= FLAG_FALLBACK if empty else 0
         steered, barred = self.minimum_time(rows[0], offset, r, may_start)
         if steered is not None:
             self.landing, self.binding = True, STEERED
             return steered
-        if empty or (barred and square(last.voltage(self.i)) > self.V_max * self.V_max):
+        if not barred and not self.time_to_go > 0 and may_start:
+            v, self.binding = self.solve(rows, steady, r)
             return v
-        if barred or self.time_to_go > 0 or not may_start:
-            self.binding = 0
-            return project_row(rows[0], r)
-        v, self.binding = self.solve(rows, steady, r)
-        return v
+        v = smallest_voltage(last, rows[0])
+        empty = bool(square(last.voltage(v)) > EMPTY_MARGIN * last.V * last.V)
+        self.flags |= FLAG_FALLBACK if empty else 0
+        if empty or (barred and square(last.voltage(self.i)) > self.V_max * self.V_max):
+            self.binding = EMPTY
+            return v
+        self.binding = 0
+        v = project_row(rows[0], r)
+        return self.slide(rows, r, v) if len(rows) > steady + 1 else v
 
     def at_time(self, T: np.float32, a: Vector, b: Vector, drops: tuple[Vector, Vector]) -> tuple:
         """Way, its rate, gap, the slope of the gap times the way's length, and that length after time T."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.poisoned_periods import ASKED, FAILURES, LAWS, SAMPLED, run
+from benchmarks.poisoned_periods import ASKED, AWAY, FAILURES, LAWS, NODES, SAMPLED, Case, run
 from pmsmtool.firmware.core_binding import core
 from tests.firmware.closed_loop import MODE_CURRENT, Loop, tuned
 
@@ -86,6 +86,27 @@ def test_a_destroyed_memory_starts_from_rest(member: str) -> None:
     for _ in range(400):
         loop.step(mode=MODE_CURRENT, i_q_ref=20.0)
     assert loop.plant.i[1] == pytest.approx(20.0, abs=0.1)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 1e30, -1e30, -1.0])
+def test_a_destroyed_node_of_the_saturation_table_leaves_the_controller_as_it_was(value: float) -> None:
+    """Every word of the table for two periods: 2.2 of what V_max moves in a period before nodes were looked at."""
+    case = Case(np.random.default_rng(3), "saturated, best, predictor")
+    loop, (first, end) = case.loop, case.words[NODES]
+    case.mode = MODE_CURRENT
+    for _ in range(200):
+        case.good()
+    for word in range(first, end):
+        if (word - first) % 4 == 0 and value == -1.0:
+            continue  # a flux may be negative
+        before = loop.plant.i.copy()
+        for _ in range(2):
+            case.bad(NODES, value, word)
+        assert loop.state.fault == 0 and loop.output.gates == 1
+        case.good()
+        assert case.flux(loop.plant.i - before) < AWAY
+        for _ in range(20):
+            case.good()
 
 
 def test_a_fault_shorts_the_windings_above_its_speed_only() -> None:

@@ -117,7 +117,7 @@ def test_lookup_equals_the_twin_in_both_formats(kind: int, n_z: int, holes: bool
         values = tuned(field_weakening__mode=1) | descriptor | {"lut.format": fmt, "motor.I_max_apk": 45.0}
         twin = Twin(values, axes, tables)
         loop = Loop(core(), values, omega=0, lut=lut)
-        for k in range(300):
+        for k in range(700):
             loop.plant.omega = 0.0
             loop.plant.i = np.zeros(2)
             omega = float(f(rng.uniform(-900, 900)))
@@ -127,6 +127,9 @@ def test_lookup_equals_the_twin_in_both_formats(kind: int, n_z: int, holes: bool
                 U_dc = float(rng.choice(axes[2]))
             elif k % 3 == 2:
                 U_dc = float(f(rng.uniform(0, 30)))
+            if k >= 300:  # speed and link drift: the torque is cut where it was, or a node beside it
+                omega, U_dc = float(f(300 + 2 * (k - 300))), float(f(250 - 0.2 * (k - 300)))
+                tau = float(f(40.0 if k < 500 else -40.0))
             m = loop.measurement
             m.i_a = m.i_b = m.i_c = 0.0
             m.theta_e, m.omega_e, m.U_dc = 0.1, omega, U_dc
@@ -141,6 +144,24 @@ def test_lookup_equals_the_twin_in_both_formats(kind: int, n_z: int, holes: bool
             seen |= live.flags
     assert seen & FLAG_EDGE
     assert bool(seen & FLAG_NO_POINT) == holes
+
+
+def test_a_cut_torque_is_sought_once() -> None:
+    """The nodes of the search are steps of one period; then the place is known, also where speed and limit drift."""
+    torque, speed = np.linspace(-100, 100, 41), np.linspace(0, 900, 17)
+    i_q = np.broadcast_to((torque / 2.46)[:, None], (41, 17))
+    i_d = -0.01 * speed[None, :] * np.ones((41, 1)) - 0.02 * np.abs(i_q)
+    lut = b"".join(np.asarray(x, dtype=f).tobytes() for x in (torque, speed, [210.0], i_d, i_q))
+    layout = {"lut.format": 1, "lut.n_x": 41, "lut.n_y": 17, "lut.n_z": 1, "lut.axis_kind": 0}
+    loop = Loop(core(), tuned(field_weakening__mode=1) | layout | {"motor.I_max_apk": 20.0}, omega=0.0, lut=lut)
+    looked, sizes = [], []
+    for k in range(40):
+        loop.plant.omega = (100 + k) * 4 * math.pi / 30
+        live = loop.step(mode=MODE_TORQUE, tau_ref=-90.0)
+        looked.append(live.iterations)
+        sizes.append(math.hypot(live.i_d_req, live.i_q_req))
+    assert looked[0] > 0 and sum(looked[1:]) == 0
+    assert sizes == pytest.approx([20.0] * 40, rel=1e-5)
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -121,7 +121,7 @@ def test_the_example_that_the_page_names_checks_the_constants(changed: bool, tmp
 
 
 def test_the_share_of_a_fast_period_exceeds_it() -> None:
-    slow, fast = (period_share(values({"governor.mode": 3}) | {"inverter.T_s_ns": T}) for T in (83_333.0, 40_000.0))
+    slow, fast = (period_share(values({"governor.mode": 3}) | {"inverter.T_s_ns": T}) for T in (83_333.0, 35_000.0))
     assert slow < 1.0 < fast
 
 
@@ -165,8 +165,8 @@ def test_the_page_takes_the_counted_law_of_the_set(changes: dict[str, float], la
 
 
 def test_a_set_with_the_tables_of_a_saturated_machine_states_its_own_cost() -> None:
-    """It stated that of the constant inductances, 54 % of a period instead of 84."""
+    """It stated that of the constant inductances, 45 % of a period instead of 51."""
     saturated = {"governor.mode": 3, "saturation.n_d": 7, "field_weakening.mode": 1}
     assert counted_law(values(saturated)) == "saturated: best + table"
     assert counted_law(values({**saturated, "governor.options": 2})) == "saturated: best + table, predictor"
-    assert period_share(values({**saturated, "inverter.T_s_ns": 83333})) > 0.8
+    assert period_share(values(saturated)) > 1.1 * period_share(values({"governor.mode": 3}))

@@ -241,3 +241,23 @@ def test_the_integer_square_root_of_the_soft_float_build_is_correctly_rounded(tm
         (x,) = struct.unpack("<f", struct.pack("<I", int(word)))
         assert struct.pack("<f", root(x)) == np.sqrt(f(x)).tobytes(), hex(int(word))
     assert math.isnan(root(-1.0))
+
+
+@pytest.mark.parametrize(
+    ("words", "cycles"),
+    [
+        ((0xEEB0, 0x0AC0), 1),  # VABS
+        ((0xEEB4, 0x0A60), 1),  # VCMP
+        ((0xEEB0, 0x0A60), 1),  # VMOV of registers
+        ((0xEEF1, 0xFA10), 1),  # VMRS
+        ((0xEE80, 0x0A81), 14),  # VDIV
+        ((0xEEB1, 0x0AC0), 14),  # VSQRT
+        ((0xEE00, 0x0A81), 3),  # VMLA
+        ((0xEEA0, 0x0A81), 3),  # VFMA
+        ((0xEE90, 0x0A81), 3),  # VFNMS
+        ((0xED90, 0x0A00), 2),  # VLDR
+    ],
+)
+def test_cycles_of_an_instruction_are_those_of_the_manual(words: tuple[int, int], cycles: int) -> None:
+    """Cortex-M4 technical reference manual, instruction set of the floating-point unit."""
+    assert cortex_m.weight(struct.pack("<HH", *words)) == cycles

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pmsmtool.commissioning.export_q import ONE, fixed_point_files, q_files, q_format
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.core_binding import core
 from pmsmtool.firmware.export_c import FLAGS
-from pmsmtool.firmware.export_q import ONE, fixed_point_files, q_files, q_format
 from tests.firmware.closed_loop import LINE, MODE_CURRENT, RPM, Loop, reference_case
 from tests.firmware.governor_q import FixedPointGovernor
 

@@ -40,8 +40,6 @@ typedef struct {                  /* a projection under way; rows can be added t
     pmsm_real inverse[PMSM_PROJECTION_ROWS]; /* 1/V^2 */
     uint32_t count;
     uint32_t basis[2];            /* active rows, the one added last first; PMSM_PROJECTION_NONE when free */
-    uint32_t limit, goal;         /* rows of smallest, when it is known beforehand, else PMSM_PROJECTION_NONE */
-    pmsm_dq smallest;             /* pmsm_smallest_voltage(goal, limit) */
     pmsm_dq r;                    /* projected */
     pmsm_dq v;                    /* nearest point to r that satisfies the rows so far */
 } pmsm_active_set;
@@ -53,9 +51,6 @@ static inline void pmsm_projection_begin(pmsm_active_set *set, const pmsm_row *r
     set->count = 0u;
     set->basis[0] = PMSM_PROJECTION_NONE;
     set->basis[1] = PMSM_PROJECTION_NONE;
-    set->limit = PMSM_PROJECTION_NONE;
-    set->goal = PMSM_PROJECTION_NONE;
-    set->smallest = r;
     set->r = r;
     set->v = r;
 }

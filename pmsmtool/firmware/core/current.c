@@ -165,7 +165,7 @@ void pmsm_current_integrate(pmsm_period *period)
 
 /* Current at the start of the next period under the voltage that acts in this one. Flux in the stator frame is
  * integrated with the resistance drop at the mean current, then seen from the rotor turned by omega_e T_s. */
-pmsm_dq pmsm_predict_current(pmsm_period *period)
+void pmsm_predict_current(pmsm_period *period)
 {
     const pmsm_real T_s = period->state->derived.T_s;
     const pmsm_ab committed = {period->state->voltage_committed.d, period->state->voltage_committed.q};
@@ -187,5 +187,7 @@ pmsm_dq pmsm_predict_current(pmsm_period *period)
     pmsm_dq next;
     next.d = (L_d * period->i.d + (turned.d - psi.d)) / (L_d + drop);
     next.q = (L_q * period->i.q + (turned.q - psi.q)) / (L_q + drop);
-    return next;
+    period->i_model = next;
+    period->flux_model.d = turned.d - drop * next.d;
+    period->flux_model.q = turned.q - drop * next.q;
 }

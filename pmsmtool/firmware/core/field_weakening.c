@@ -15,8 +15,10 @@
 #include "active_set.h"
 #include "pmsm_period.h"
 
-#define STEPS_PER_PERIOD 11u         /* Newton steps after which an accelerated call goes on in the next period */
-#define STEPS_MOST 14u               /* and those that it may take in one */
+#define STEPS_MOST 14u               /* Newton steps that an accelerated call may take in a period, */
+#define STEPS_FALLING 12u            /* while the link falls: the governor needs the others; */
+#define STEPS_LEFT 3u                /* with as many left it goes on in the next period */
+#define FALLING PMSM_C(0.99)         /* of the link's voltage, where it is going to be */
 #define CORNER_STEPS 4u              /* of Newton's method for the corner, from near it */
 #define CORNER_NONE 0u
 #define CORNER_KNOWN 1u
@@ -25,6 +27,7 @@
 #define STEP_END PMSM_C(2e-5)        /* A: a smaller change ends the iteration */
 #define HALVINGS 8u                  /* of an Armijo step */
 #define TORQUE_EVENT PMSM_C(0.02)    /* of rated torque: a larger change of the request is answered at once */
+#define LINK_EVENT PMSM_C(0.02)      /* of the link's voltage, likewise */
 #define WITHIN PMSM_C(1.000002)       /* on the square: rounding of a point on a row's boundary */
 #define IGNORED_SHARE PMSM_C(1e-3)   /* below this share of V_m the rotation voltage of I_m does not matter */
 
@@ -50,7 +53,8 @@ static pmsm_row voltage_row(const pmsm_period *period)
     const pmsm_real R = (p->field_weakening_mode == PMSM_FW_ACCELERATED) ? period->R_s : PMSM_C(0.0);
     pmsm_row row = {R, -omega * period->magnetics->L_q_app, omega * period->magnetics->L_d_app, R,
                     PMSM_C(0.0), omega * period->magnetics->psi_f,
-                    (PMSM_C(1.0) - (pmsm_real)p->field_weakening_margin) * period->V_max};
+                    (PMSM_C(1.0) - (pmsm_real)p->field_weakening_margin) *
+                        ((pmsm_real)p->inverter_voltage_utilisation * period->U_ahead)};
     if (p->field_weakening_mode != PMSM_FW_UNCOMPENSATED) { /* through the voltage that holds the present current */
         const pmsm_dq hold = pmsm_hold_voltage(period, period->i);
         row.c_d = hold.d - (row.m_dd * period->i.d + row.m_dq * period->i.q);
@@ -276,7 +280,7 @@ static pmsm_dq gradient_steps(problem *q, const pmsm_params *params, pmsm_dq x)
  * momentum of the last iteration. */
 static void accelerated_steps(problem *q, pmsm_state *state)
 {
-    const uint32_t last = q->steps + STEPS_PER_PERIOD;
+    const uint32_t last = PMSM_PROJECTION_STEPS - STEPS_LEFT;
     pmsm_real t = state->fw_momentum;
     pmsm_dq x = state->fw_reference;
     pmsm_dq y = state->fw_ahead;
@@ -327,7 +331,10 @@ static uint32_t is_due(const pmsm_period *period, pmsm_real tau)
     }
     const pmsm_real rated =
         state->derived.torque_per_flux * (pmsm_real)params->motor_psi_f_wb * (pmsm_real)params->motor_I_nom_apk;
-    const uint32_t event = (pmsm_abs(tau - state->fw_tau) > TORQUE_EVENT * rated) ? 1u : 0u;
+    const uint32_t event = (pmsm_abs(tau - state->fw_tau) > TORQUE_EVENT * rated ||
+                            pmsm_abs(period->U_ahead - state->fw_U_dc) > LINK_EVENT * state->fw_U_dc)
+                               ? 1u
+                               : 0u;
     return (params->field_weakening_mode == PMSM_FW_ACCELERATED) ? event : 0u;
 }
 
@@ -339,6 +346,7 @@ pmsm_dq pmsm_field_weakening(pmsm_period *period, pmsm_real tau)
         state->fw_count = params->field_weakening_N_fw;
         state->fw_left = params->field_weakening_iterations;
         state->fw_tau = tau;
+        state->fw_U_dc = period->U_ahead;
         state->fw_momentum = PMSM_C(1.0);
         state->fw_ahead = state->fw_reference;
     }
@@ -346,10 +354,12 @@ pmsm_dq pmsm_field_weakening(pmsm_period *period, pmsm_real tau)
         problem q = state_problem(period, tau);
         q.left = state->fw_left;
         if (q.accelerated != 0u) {
-            q.steps = PMSM_PROJECTION_STEPS - STEPS_MOST;
+            const uint32_t falls = (period->U_ahead < FALLING * period->U_dc) ? 1u : 0u;
+            const uint32_t before = PMSM_PROJECTION_STEPS - ((falls != 0u) ? STEPS_FALLING : STEPS_MOST);
+            q.steps = before;
             accelerated_steps(&q, state);
             state->fw_left = q.left;
-            q.steps -= PMSM_PROJECTION_STEPS - STEPS_MOST;
+            q.steps -= before;
             period->steps += q.steps;
         } else {
             state->fw_reference = gradient_steps(&q, params, state->fw_reference);

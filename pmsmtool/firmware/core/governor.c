@@ -109,65 +109,86 @@ static uint32_t acts_late(const pmsm_period *period)
 }
 
 /* A voltage that acts late meets another current than the sampled one: the transfer starts from the predicted one. */
-static enum pmsm_transfer steer(pmsm_period *period, const pmsm_governor_rows *rows, pmsm_dq r, pmsm_dq *v)
+static enum pmsm_transfer steer(pmsm_period *period, const pmsm_governor_rows *rows, pmsm_dq r, pmsm_dq *v,
+                                uint32_t *steps)
 {
-    if (acts_late(period) == 0u) {
-        return pmsm_minimum_time(period, &rows->row[0], rows->offset, r, rows->may_start, v);
-    }
-    const pmsm_dq sampled = period->i_model;
-    const pmsm_magnetics *magnetics = period->magnetics;
-    const pmsm_magnetics here = *magnetics;
-    period->i_model = pmsm_predict_current(period);
-    if (magnetics == &period->state->local) {
-        pmsm_saturate(period, period->i_model);
+    const pmsm_dq seen = period->i_model;
+    pmsm_dq from = pmsm_flux_here(period->magnetics, seen);
+    if (acts_late(period) != 0u) {
+        pmsm_predict_current(period);
+        from = period->flux_model;
     }
     const enum pmsm_transfer found =
-        pmsm_minimum_time(period, &rows->row[0], rows->offset, r, rows->may_start, v);
-    if (magnetics == &period->state->local) {
-        period->state->local = here;
-    }
-    period->i_model = sampled;
+        pmsm_minimum_time(period, &rows->row[0], rows->offset, from, r, rows->may_start, v, steps);
+    period->i_model = seen;
     return found;
 }
 
 /* An inadmissible request: along the minimum-time direction where that is asked for and possible, else what the solver
- * of the mode finds. Whether row 0 and the steady state can be met at once is settled first: an empty set changes what
- * the direction may do to the current, and the smallest steady-state voltage is then the answer. So it is where the
- * direction is barred by the current limit and the voltage cannot hold the present current; where it can, row 0. */
+ * of the mode finds. Where there is no time for that, row 0 alone, unless it and the steady state cannot be met at once:
+ * the smallest steady-state voltage is then the answer. So it is where the direction is barred by the current limit and
+ * the voltage cannot hold the present current. */
 static pmsm_dq restrain(pmsm_period *period, pmsm_governor_rows *rows, pmsm_dq r, uint32_t *binding, uint32_t *steps)
 {
     pmsm_state *state = period->state;
     const pmsm_row *steady = &rows->row[rows->steady];
+    pmsm_dq v = r;
     if (pmsm_has_option(period, PMSM_GOVERNOR_MINIMUM_TIME) == 0u || asks_first(period->params) == 0u) {
         return pmsm_governor_solve(period, rows, r, binding, steps);
     }
-    const uint32_t busy = (period->steps > 0u) ? 1u : 0u;
-    pmsm_dq v = r;
-    uint32_t empty = 0u;
-    if (busy == 0u) {
-        v = pmsm_smallest_voltage(steady, &rows->row[0], steps);
-        empty = (pmsm_square(pmsm_voltage_of(steady, v)) > EMPTY_MARGIN * steady->V * steady->V) ? 1u : 0u;
-        rows->smallest_known = 1u;
-        rows->smallest = v;
+    if (period->looked > PMSM_LUT_NODES) { /* a transfer under way waits */
+        *binding = 0u;
+        return pmsm_governor_slide(rows, r, pmsm_project_row(&rows->row[0], r, steps), steps);
     }
-    *binding = PMSM_BINDING_EMPTY;
-    period->flags |= (empty != 0u) ? (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK : 0u;
-    const enum pmsm_transfer transfer = steer(period, rows, r, &v);
+    const uint32_t costly = (rows->may_start == 0u && period->looked > 0u) ? 1u : 0u; /* look-up and corner */
+    const uint32_t busy = (period->steps > 0u || costly != 0u) ? 1u : 0u;
+    const enum pmsm_transfer transfer = steer(period, rows, r, &v, steps);
     if (transfer == PMSM_TRANSFER_FOUND) {
         state->landing = (acts_late(period) == 0u) ? 1u : 0u; /* what is on its way would be asked for again */
         *binding = PMSM_BINDING_MINIMUM_TIME;
         return v;
     }
-    const uint32_t barred = (transfer == PMSM_TRANSFER_BARRED) ? 1u : 0u;
-    const pmsm_real hold = pmsm_square(pmsm_voltage_of(steady, period->i_model));
-    if (busy == 0u && (empty != 0u || (barred != 0u && hold > period->V_max * period->V_max))) {
-        return v; /* out of the reach of the voltage: back into it first */
+    if (busy == 0u && transfer == PMSM_TRANSFER_NONE && rows->may_start != 0u) {
+        return pmsm_governor_solve(period, rows, r, binding, steps);
     }
-    if (busy != 0u || barred != 0u || transfer == PMSM_TRANSFER_SOUGHT || rows->may_start == 0u) { /* little time */
-        *binding = 0u;
-        return pmsm_project_row(&rows->row[0], r, steps);
+    if (busy == 0u) {
+        const pmsm_real hold = pmsm_square(pmsm_voltage_of(steady, period->i_model));
+        v = pmsm_smallest_voltage(steady, &rows->row[0], steps);
+        const uint32_t empty =
+            (pmsm_square(pmsm_voltage_of(steady, v)) > EMPTY_MARGIN * steady->V * steady->V) ? 1u : 0u;
+        period->flags |= (empty != 0u) ? (uint32_t)PMSM_FLAG_GOVERNOR_FALLBACK : 0u;
+        if (empty != 0u || (transfer == PMSM_TRANSFER_BARRED && hold > period->V_max * period->V_max)) {
+            *binding = PMSM_BINDING_EMPTY; /* out of the reach of the voltage: back into it first */
+            return v;
+        }
     }
-    return pmsm_governor_solve(period, rows, r, binding, steps);
+    *binding = 0u;
+    v = pmsm_project_row(&rows->row[0], r, steps);
+    return (costly != 0u) ? v : pmsm_governor_slide(rows, r, v, steps);
+}
+
+/* v is the point of a row nearest to r, and outside the circle: the nearest point to r inside both, if there is one. */
+static void meet_both(const pmsm_row *row, const pmsm_row *circle, pmsm_dq r, pmsm_dq *v, uint32_t *steps)
+{
+    const pmsm_real square = pmsm_square(r);
+    const uint32_t inside = (square <= circle->V * circle->V) ? 1u : 0u;
+    pmsm_dq outside = *v;
+    if (inside == 0u) {
+        const pmsm_real share = circle->V / PMSM_SQRT(square);
+        outside.d = share * r.d;
+        outside.q = share * r.q;
+        if (pmsm_square(pmsm_voltage_of(row, outside)) <= row->V * row->V) {
+            *v = outside;
+            return;
+        }
+    }
+    const pmsm_row *first = (inside != 0u) ? row : circle;
+    const pmsm_row *second = (inside != 0u) ? circle : row;
+    const pmsm_dq best = pmsm_smallest_voltage(second, first, steps);
+    pmsm_dq corner;
+    if (pmsm_project_pair(first, second, r, outside, best, &corner, steps) != 0u) {
+        *v = corner;
+    }
 }
 
 /* The reachable request: inside the steady-state row, and inside the current row where both can be met. The second is
@@ -183,24 +204,18 @@ static pmsm_dq pre_project(pmsm_period *period, pmsm_governor_rows *rows, pmsm_d
     pre.V *= PRE_PROJECTION_MARGIN;
     pmsm_dq v = pmsm_project_row(&pre, r, steps);
     state->reachable_age = 0u;
+    rows->reachable = 1u;
     if (rows->count <= rows->steady + 1u || pmsm_square(v) <= last->V * last->V) {
         return v;
     }
     if (fresh != 0u && state->time_to_go <= PMSM_C(0.0)) {
         return state->reachable;
     }
-    rows->may_start = 0u;
+    rows->may_start = 0u; /* and row 0 alone */
     if (period->steps > 0u) {
         return v;
     }
-    const pmsm_row both[2] = {pre, *last};
-    pmsm_active_set set;
-    pmsm_projection_begin(&set, both, r);
-    set.v = v; /* the first row is solved already */
-    set.basis[0] = (v.d != r.d || v.q != r.q) ? 0u : PMSM_PROJECTION_NONE;
-    if (pmsm_projection_extend(&set, 2u, steps) != PMSM_PROJECTION_EMPTY) {
-        v = set.v; /* else it stays */
-    }
+    meet_both(&pre, last, r, &v, steps);
     state->reachable = v;
     state->reachable_age = 1u;
     return v;

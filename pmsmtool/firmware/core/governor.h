@@ -15,9 +15,12 @@ typedef struct {
     uint32_t built;    /* rows 0..built - 1 and from steady on stand; prediction rows only when they are needed */
     pmsm_dq offset;    /* V, beside the nominal model in the steady state */
     uint32_t may_start;/* 0: this period has no time left to start a minimum-time transfer, or for more than row 0 */
-    uint32_t smallest_known;
-    pmsm_dq smallest;  /* A, of the smallest steady-state voltage under row 0 */
+    uint32_t reachable;/* 1: the request was projected on steady-state and current row */
 } pmsm_governor_rows;
+
+/* A point on row 0 that is well outside the current row: a corner of row 0 just outside the other, where there is one.
+ * The current then slides along its limit with the whole voltage. */
+pmsm_dq pmsm_governor_slide(const pmsm_governor_rows *rows, pmsm_dq r, pmsm_dq v, uint32_t *steps);
 
 static inline uint32_t pmsm_has_option(const pmsm_period *period, uint32_t option)
 {

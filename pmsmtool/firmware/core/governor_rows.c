@@ -145,7 +145,7 @@ void pmsm_governor_build(pmsm_period *period, pmsm_governor_rows *rows)
         now->V = pmsm_voltage_radius(period, pmsm_voltage_of(now, period->reference));
     }
     rows->may_start = 1u;
-    rows->smallest_known = 0u;
+    rows->reachable = 0u;
     rows->built = 1u;
     rows->steady = 1u + prediction_rows(period->params);
     rows->offset = steady_offset(period, now);

@@ -6,22 +6,48 @@
 #define POLYGON 8u /* faces that stand for the circle in the linearised mode */
 #define POLYGON_INNER PMSM_C(0.92387953251128675613) /* cos(pi/8): the polygon lies inside the circle */
 
+#define SLIDE_STEPS 3u                /* of the search for the corner */
+#define SLIDE_SHARE PMSM_C(1.02)      /* of the current limit: nothing slides at rest in its corner with the steady state */
+#define SLIDE_MARGIN PMSM_C(1.0001)   /* on the square, of the rows in what was found */
+
+pmsm_dq pmsm_governor_slide(const pmsm_governor_rows *rows, pmsm_dq r, pmsm_dq v, uint32_t *steps)
+{
+    const pmsm_row *now = &rows->row[0];
+    if (rows->count <= rows->steady + 1u) {
+        return v;
+    }
+    pmsm_row circle = rows->row[rows->count - 1u];
+    circle.V *= SLIDE_SHARE;
+    const pmsm_real limit = circle.V * circle.V;
+    const pmsm_real square = pmsm_square(v);
+    if (square <= limit) {
+        return v;
+    }
+    const pmsm_real share = circle.V / PMSM_SQRT(square);
+    pmsm_dq corner = {share * v.d, share * v.q};
+    (void)pmsm_find_corner(now, &circle, r, SLIDE_STEPS, &corner, steps);
+    const uint32_t within = (pmsm_square(corner) <= SLIDE_MARGIN * limit &&
+                             pmsm_square(pmsm_voltage_of(now, corner)) <= SLIDE_MARGIN * now->V * now->V)
+                                ? 1u
+                                : 0u;
+    return (within != 0u) ? corner : v;
+}
+
 uint32_t pmsm_governor_project(const pmsm_governor_rows *rows, pmsm_dq r, pmsm_dq *v, uint32_t *active,
                                uint32_t *steps)
 {
     pmsm_active_set set;
     pmsm_projection_begin(&set, rows->row, r);
-    if (rows->smallest_known != 0u) {
-        set.limit = 0u;
-        set.goal = rows->steady;
-        set.smallest = rows->smallest;
-    }
     if (pmsm_projection_extend(&set, rows->steady + 1u, steps) == PMSM_PROJECTION_EMPTY) {
         return PMSM_PROJECTION_EMPTY;
     }
     *v = set.v;
     *active = set.basis[0];
     if (rows->count > rows->steady + 1u) {
+        if (rows->reachable != 0u) { /* row 0 alone holds it back: an exact exchange would take the rest of the period */
+            *v = (set.basis[1] == PMSM_PROJECTION_NONE) ? pmsm_governor_slide(rows, r, set.v, steps) : set.v;
+            return 1u;
+        }
         if (pmsm_projection_extend(&set, rows->count, steps) == PMSM_PROJECTION_EMPTY) {
             return 0u;
         }

@@ -3,10 +3,6 @@
 #include "pmsm_image.h"
 #include "pmsm_modes.h"
 
-#define PMSM_FLUX_MOST 100.0F         /* Wb */
-#define PMSM_INDUCTANCE_LEAST 1e-7F   /* H */
-#define PMSM_INDUCTANCE_MOST 10.0F    /* H */
-
 static uint32_t word_at(const uint8_t *image, uint32_t word)
 {
     const uint8_t *p = image + 4u * word;

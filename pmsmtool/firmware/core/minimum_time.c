@@ -11,6 +11,7 @@
 #define SHORTEST_PERIODS PMSM_C(3.0) /* a shorter transfer is left to the projection */
 #define NEAR_SHARE PMSM_C(0.2)       /* of V_max T_s: a shorter way may be noise, and is left to the projection */
 #define TRIALS 2u /* then the search goes on in the next period; 2.8 in the mean to start, 1 to follow */
+#define TRIAL_STEPS 2u /* a trial takes as long as so many Newton steps of a row */
 #define DIRECT_SHARE PMSM_C(0.7)     /* first guess, of the time at standstill */
 #define GROWTH PMSM_C(1.0)           /* of T, where the gap does not close yet */
 #define LONGEST_STEP PMSM_C(1.0)     /* rad */
@@ -71,12 +72,15 @@ static pmsm_real next_time(const transfer *t, const transfer_point *point, pmsm_
 }
 
 /* The time T of the transfer and the way m, from a first guess. Not when it is shorter than least. */
-static enum pmsm_transfer find_time(const transfer *t, pmsm_real least, pmsm_real *T, pmsm_dq *m)
+static enum pmsm_transfer find_time(const transfer *t, pmsm_real least, pmsm_real *T, pmsm_dq *m, uint32_t *steps)
 {
     pmsm_real low = PMSM_C(0.0);
     pmsm_real high = PMSM_C(0.0);
-    for (uint32_t k = 0u; k < TRIALS && *T * pmsm_abs(t->omega) <= LONGEST_ANGLE; k++) {
+    const uint32_t most = *steps + TRIALS * TRIAL_STEPS;
+    const uint32_t end = (most < PMSM_PROJECTION_STEPS) ? most : PMSM_PROJECTION_STEPS;
+    while (*steps + TRIAL_STEPS <= end && *T * pmsm_abs(t->omega) <= LONGEST_ANGLE) {
         const transfer_point point = at_time(t, *T);
+        *steps += TRIAL_STEPS;
         if (point.slope < PMSM_C(0.0) && pmsm_abs(point.gap) <= ACCURACY * t->V * *T) {
             const pmsm_real last = -point.gap * point.size / point.slope;
             m->d = point.m.d + last * point.rate.d;
@@ -161,15 +165,15 @@ static uint32_t is_cornered(const pmsm_period *period, pmsm_dq offset)
 
 /* offset: voltage beside the model's, which turns with the rotor as the resistance drop does. may_start: 0 only follows
  * a transfer that is under way, which takes little time. */
-enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq offset, pmsm_dq target,
-                                     uint32_t may_start, pmsm_dq *v)
+enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq offset, pmsm_dq from,
+                                     pmsm_dq target, uint32_t may_start, pmsm_dq *v, uint32_t *steps)
 {
     pmsm_state *state = period->state;
     const pmsm_real T_s = state->derived.T_s;
     const pmsm_dq i = period->i_model;
     const pmsm_real half = PMSM_C(0.5);
     const pmsm_real R = period->R_s;
-    const transfer t = {pmsm_flux(period, i), pmsm_flux(period, target),
+    const transfer t = {from, pmsm_flux(period, target),
                         {half * (R * i.d + offset.d), half * (R * i.q + offset.q)},
                         {half * (R * target.d + offset.d), half * (R * target.q + offset.q)},
                         period->omega_e, period->V_max};
@@ -184,11 +188,11 @@ enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, p
     pmsm_dq m;
     enum pmsm_transfer found = PMSM_TRANSFER_NONE;
     if (T > PMSM_C(0.0)) {
-        found = find_time(&t, least, &T, &m);
+        found = find_time(&t, least, &T, &m, steps);
     } else if (may_start != 0u && is_cornered(period, offset) == 0u) {
         T = DIRECT_SHARE * PMSM_SQRT(pmsm_square(way)) / t.V;
         T = (T > least) ? T : least;
-        found = find_time(&t, least, &T, &m);
+        found = find_time(&t, least, &T, &m, steps);
     }
     state->time_to_go = (found == PMSM_TRANSFER_SOUGHT) ? T : PMSM_C(0.0);
     if (found != PMSM_TRANSFER_FOUND) {

@@ -177,18 +177,21 @@ typedef struct {             /* per-axis controller memory and whatever the mode
     uint32_t cornered;       /* steps of that search, 255: found */
     uint32_t landing;        /* 1: a minimum-time transfer has not reached its target yet */
     pmsm_real fw_tau;        /* N m, request of the last optimisation */
+    pmsm_real fw_U_dc;       /* V, link of the last optimisation */
     uint32_t fw_left;        /* iterations that it has left for the following periods */
     pmsm_real fw_momentum;   /* of its last iteration, and the point ahead from which the next one starts (A) */
     pmsm_dq fw_ahead;
     pmsm_real fw_multiplier; /* of the voltage row in its last projection */
     uint32_t fw_corner_state; /* whether that was on the current row, too */
     uint32_t fw_empty;       /* 1: it found no current that satisfies both limits */
+    uint32_t lut_cut;        /* 1 + the last node of the torque axis inside the current limit, 0: torque was not cut */
     pmsm_real i2t_carry;     /* rounding remainder of i2t */
     uint32_t i2t_exhausted;  /* 1 from a used-up budget until a tenth of it has recovered */
     uint32_t bad_periods;    /* running, up to now */
     uint32_t fault;          /* enum pmsm_fault, latched */
     uint32_t gates_before;   /* of the last period */
     uint32_t shorted;        /* 1: the fault reaction shorts the windings */
+    pmsm_real U_dc_slow;     /* V, mean over some 2 ms */
     pmsm_real U_dc_before;   /* V, of the last good period */
     uint32_t prepared;       /* 0 fresh from pmsm_init(), 1 derived is valid, 2 derived is stale */
     pmsm_derived derived;

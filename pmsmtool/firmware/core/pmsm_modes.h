@@ -55,6 +55,9 @@ enum pmsm_lut_axis { PMSM_LUT_SPEED_RPM = 0, PMSM_LUT_FLUX_LIMIT = 1 };
 
 /* Words of a node of the saturation table. */
 #define PMSM_SATURATION_VALUES 4u
+#define PMSM_FLUX_MOST 100.0F         /* Wb; what a node may hold */
+#define PMSM_INDUCTANCE_LEAST 1e-7F   /* H */
+#define PMSM_INDUCTANCE_MOST 10.0F    /* H */
 
 enum pmsm_polar_mode {
     PMSM_POLAR_OFF = 0,

@@ -22,6 +22,7 @@ typedef struct {
     pmsm_real omega_e;         /* rad/s */
     pmsm_real omega_M;         /* rad/s */
     pmsm_real U_dc;            /* V */
+    pmsm_real U_ahead;         /* V, less while the link falls: where currents are looked for */
     pmsm_real V_max;           /* V, radius of the voltage circle */
     pmsm_real R_s;             /* ohm, at the winding temperature */
     pmsm_real sine, cosine;    /* of the sampled angle */
@@ -29,12 +30,14 @@ typedef struct {
     pmsm_real sine_out, cosine_out; /* of the angle at the middle of the applied voltage */
     pmsm_dq i;                 /* A, sampled */
     pmsm_dq i_model;           /* A, the current the proportional part sees: sampled, or predicted */
+    pmsm_dq flux_model;        /* Wb, of a predicted one */
     pmsm_dq reference;         /* A, what the current controller shall reach */
     pmsm_dq u;                 /* V, demanded */
     pmsm_dq u_realised;        /* V, after the limits, without dead-time compensation */
     pmsm_dq u_compensation;    /* V, dead-time compensation, when it is to be recorded */
     uint32_t flags;
     uint32_t steps;            /* Newton steps of field weakening and governor, up to PMSM_PROJECTION_STEPS */
+    uint32_t looked;           /* nodes of a look-up table; each beyond PMSM_LUT_NODES is a step */
     pmsm_dq i_harmonic;        /* A, of overmodulation: sampled, not in i */
     pmsm_dq u_harmonic;        /* V, stator frame: what overmodulation adds to u_realised */
 } pmsm_period;
@@ -45,6 +48,11 @@ void pmsm_prepare(pmsm_state *state, const pmsm_params *params);
 /* saturation.c: period->magnetics at a current, from the table of the parameter set */
 void pmsm_saturate(pmsm_period *period, pmsm_dq i);
 pmsm_dq pmsm_flux(const pmsm_period *period, pmsm_dq i); /* Wb, at any current */
+static inline pmsm_dq pmsm_flux_here(const pmsm_magnetics *m, pmsm_dq i) /* at the current of m, or near it */
+{
+    const pmsm_dq psi = {m->psi_f + m->L_d_app * i.d, m->L_q_app * i.q};
+    return psi;
+}
 
 /* reference.c: protection, torque and speed to a current request */
 void pmsm_update_i2t(pmsm_period *period);
@@ -57,18 +65,9 @@ pmsm_real pmsm_torque(const pmsm_params *params, const pmsm_magnetics *magnetics
 /* field_weakening.c: currents of a torque by optimisation, every N_fw periods; sets the flag of an empty set */
 pmsm_dq pmsm_field_weakening(pmsm_period *period, pmsm_real tau);
 
-/* lookup.c: currents of a torque from the tables; sets the look-up flags. Speed and link are placed once. */
-typedef struct {
-    uint32_t index;   /* left node of the cell */
-    pmsm_real weight; /* of the right node */
-} pmsm_axis_place;
-typedef struct {
-    const uint32_t *tables;
-    pmsm_axis_place y, z;
-    pmsm_real sign; /* of torque and i_q, where the speed is mirrored */
-} pmsm_lookup_row;
-pmsm_lookup_row pmsm_lookup_at_speed(pmsm_period *period);
-pmsm_dq pmsm_lookup(pmsm_period *period, const pmsm_lookup_row *row, pmsm_real tau);
+#define PMSM_LUT_NODES 3u /* of a look-up without a search */
+/* lookup.c: currents of a torque from the tables, within a current limit (A); sets the look-up flags */
+pmsm_dq pmsm_lookup(pmsm_period *period, pmsm_real tau, pmsm_real limit);
 
 /* current.c */
 void pmsm_current_demand(pmsm_period *period);
@@ -87,16 +86,16 @@ static inline void pmsm_turn_half(pmsm_period *period) /* once per period */
  * current and minus L di/dt, which is told apart. After pmsm_turn_half(). */
 pmsm_dq pmsm_lost_voltage(const pmsm_period *period, pmsm_dq *inductive);
 void pmsm_observe_disturbance(pmsm_period *period, pmsm_real gain); /* its first-order filter */
-pmsm_dq pmsm_predict_current(pmsm_period *period);
+void pmsm_predict_current(pmsm_period *period); /* period->i_model and flux_model one period on */
 
 /* governor.c: period->reference becomes the governed one; 1: period->u is its demand */
 uint32_t pmsm_govern(pmsm_period *period);
 
-/* minimum_time.c: when found, v is the reference that steers along the minimum-time direction; sought: the search takes
- * another period; barred: it would break the transient current limit */
+/* minimum_time.c: from is the flux now (Wb). When found, v is the reference that steers along the minimum-time
+ * direction; sought: the search takes another period; barred: it would break the transient current limit */
 enum pmsm_transfer { PMSM_TRANSFER_NONE, PMSM_TRANSFER_FOUND, PMSM_TRANSFER_SOUGHT, PMSM_TRANSFER_BARRED };
-enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq offset, pmsm_dq target,
-                                     uint32_t may_start, pmsm_dq *v);
+enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, pmsm_dq offset, pmsm_dq from,
+                                     pmsm_dq target, uint32_t may_start, pmsm_dq *v, uint32_t *steps);
 
 /* polar.c: the laws of polar.mode in place of the current controller */
 void pmsm_polar_demand(pmsm_period *period);

@@ -277,7 +277,7 @@ void pmsm_polar_demand(pmsm_period *period)
         return; /* no link voltage: no phase to speak of */
     }
     if (looks_ahead(period->params) != 0u) {
-        period->i_model = pmsm_predict_current(period);
+        pmsm_predict_current(period);
     }
     if (period->state->polar.started == 0u) {
         start(period, &p);

@@ -292,9 +292,7 @@ static uint32_t exchange(pmsm_active_set *set, uint32_t k, uint32_t *steps)
         }
         const uint32_t first = (inside != 0u) ? other : k;
         const uint32_t second = (inside != 0u) ? k : other;
-        const uint32_t known = (first == set->limit && second == set->goal) ? 1u : 0u;
-        const pmsm_dq best =
-            (known != 0u) ? set->smallest : pmsm_smallest_voltage(&set->row[second], &set->row[first], steps);
+        const pmsm_dq best = pmsm_smallest_voltage(&set->row[second], &set->row[first], steps);
         pmsm_dq x;
         if (pmsm_project_pair(&set->row[first], &set->row[second], r, (inside != 0u) ? set->v : alone, best, &x,
                          steps) != 0u &&

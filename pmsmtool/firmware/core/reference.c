@@ -71,53 +71,17 @@ static pmsm_dq direct_current(const pmsm_period *period, pmsm_real tau)
     return i;
 }
 
-/* Where the way from inside the circle of the limit to outside leaves it. */
-static pmsm_real way_out(pmsm_dq inside, pmsm_dq outside, pmsm_real square)
-{
-    const pmsm_dq way = {outside.d - inside.d, outside.q - inside.q};
-    const pmsm_real a = pmsm_square(way);
-    const pmsm_real b = inside.d * way.d + inside.q * way.q;
-    const pmsm_real c = pmsm_square(inside) - square;
-    const pmsm_real root = PMSM_SQRT(b * b - a * c);
-    return (b > PMSM_C(0.0)) ? -c / (b + root) : (root - b) / a;
-}
+#define LINK_RATE PMSM_C(500.0) /* 1/s, of the mean that tells whether the link falls */
 
-#define LIMITED_LOOKUPS 2u /* besides the torque asked for and none: 0.2 % of torque left on the table at most */
-
-/* The table holds currents of the whole machine. Where they exceed the limit in force (0x6073, I2t) the torque is cut,
- * so that the field-weakening current becomes the one of the torque that is left: cutting i_q alone would give all
- * current to i_d. */
-static pmsm_dq lookup_within_limit(pmsm_period *period, pmsm_real tau)
+/* Where a falling link will be. Leading a current away from where the voltage cannot hold it takes longer than the
+ * voltage takes to fall, most of all while braking, when the EMF drives it on. */
+static pmsm_real link_ahead(pmsm_state *state, pmsm_real U_dc)
 {
-    const pmsm_real limit = pmsm_current_limit(period);
-    const pmsm_real square = limit * limit;
-    const pmsm_lookup_row row = pmsm_lookup_at_speed(period);
-    pmsm_dq outside = pmsm_lookup(period, &row, tau);
-    if (pmsm_square(outside) <= square) {
-        return outside;
-    }
-    const uint32_t flags = period->flags | (uint32_t)PMSM_FLAG_CURRENT_LIMITED;
-    pmsm_dq inside = pmsm_lookup(period, &row, PMSM_C(0.0));
-    if (pmsm_square(inside) < square) {
-        pmsm_real low = PMSM_C(0.0);
-        pmsm_real high = tau;
-        for (uint32_t k = 0u; k < LIMITED_LOOKUPS; k++) {
-            const pmsm_real middle = low + way_out(inside, outside, square) * (high - low);
-            const pmsm_dq i = pmsm_lookup(period, &row, middle);
-            if (pmsm_square(i) < square) {
-                inside = i;
-                low = middle;
-            } else {
-                outside = i;
-                high = middle;
-            }
-        }
-        const pmsm_real share = way_out(inside, outside, square);
-        inside.d += share * (outside.d - inside.d);
-        inside.q += share * (outside.q - inside.q);
-    }
-    period->flags = flags;
-    return inside;
+    const pmsm_real weight = pmsm_clamp(state->derived.T_s * LINK_RATE, PMSM_C(0.0), PMSM_C(1.0));
+    const pmsm_real before = state->U_dc_slow; /* 0: the last period had no use for it */
+    state->U_dc_slow = (before > PMSM_C(0.0)) ? before + weight * (U_dc - before) : U_dc;
+    const pmsm_real fall = U_dc - state->U_dc_slow;
+    return (fall < PMSM_C(0.0) && U_dc > -fall) ? U_dc + fall : U_dc;
 }
 
 pmsm_dq pmsm_torque_to_current(pmsm_period *period, pmsm_real tau)
@@ -125,8 +89,9 @@ pmsm_dq pmsm_torque_to_current(pmsm_period *period, pmsm_real tau)
     const pmsm_params *params = period->params;
     pmsm_dq i;
     const uint32_t mode = params->field_weakening_mode;
+    period->U_ahead = link_ahead(period->state, period->U_dc);
     if (mode == PMSM_FW_LUT && params->lut_format != PMSM_LUT_NONE && period->lut != NULL) {
-        i = lookup_within_limit(period, tau);
+        i = pmsm_lookup(period, tau, pmsm_current_limit(period));
 #if PMSM_LAW_FIELD_WEAKENING
     } else if (mode != PMSM_FW_OFF && mode != PMSM_FW_LUT) {
         i = pmsm_field_weakening(period, tau);

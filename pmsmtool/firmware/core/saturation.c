@@ -8,6 +8,7 @@
 #include "pmsm_period.h"
 
 #define VALUES PMSM_SATURATION_VALUES
+#define FLUX_MOST (PMSM_C(2.0) * (pmsm_real)PMSM_FLUX_MOST) /* Wb, between or beyond nodes */
 
 typedef union {
     uint32_t u;
@@ -30,52 +31,91 @@ static uint32_t left_node(pmsm_real x, uint32_t count, pmsm_real *rest)
     return k;
 }
 
-static void read_table(const pmsm_period *period, pmsm_dq i, pmsm_magnetics *m)
+typedef struct {          /* where a current lies in the table */
+    pmsm_dq edge;         /* A, the nearest on it, i_q without its sign */
+    pmsm_real size_q;     /* A */
+    const uint32_t *low;  /* left node, and the one a step of i_d on */
+    const uint32_t *high;
+    pmsm_dq right;        /* share of the nodes to the right */
+} table_place;
+
+static table_place find_place(const pmsm_period *period, pmsm_dq i)
 {
     const pmsm_params *p = period->params;
     const pmsm_derived *derived = &period->state->derived;
     const pmsm_real i_d_min = (pmsm_real)p->saturation_i_d_min_a;
     const pmsm_real i_q_max = (pmsm_real)p->saturation_i_q_max_a;
-    const pmsm_real size_q = pmsm_abs(i.q);
-    const pmsm_dq edge = {pmsm_clamp(i.d, i_d_min, (pmsm_real)p->saturation_i_d_max_a),
-                          (size_q < i_q_max) ? size_q : i_q_max};
-    pmsm_real right_d;
-    pmsm_real right_q;
-    const uint32_t row = left_node((edge.d - i_d_min) * derived->nodes_per_ampere.d, p->saturation_n_d, &right_d);
-    const uint32_t column = left_node(edge.q * derived->nodes_per_ampere.q, p->saturation_n_q, &right_q);
-    const uint32_t *low = period->lut + derived->saturation_word + VALUES * (row * p->saturation_n_q + column);
-    const uint32_t *high = low + VALUES * p->saturation_n_q;
-    pmsm_real found[VALUES];
-    for (uint32_t k = 0u; k < VALUES; k++) {
-        const pmsm_real a = value_at(low, k);
-        const pmsm_real b = value_at(high, k);
-        const pmsm_real at_low = a + right_q * (value_at(low, VALUES + k) - a);
-        const pmsm_real at_high = b + right_q * (value_at(high, VALUES + k) - b);
-        found[k] = at_low + right_d * (at_high - at_low);
-    }
-    m->L_d = found[2];
-    m->L_q = found[3];
-    m->L_d_app = m->L_d; /* along the tangent: psi_f takes what is left, so that psi_d is the table's */
-    m->psi_f = found[0] - m->L_d * edge.d;
-    m->L_q_app = (size_q > edge.q) ? m->L_q + (found[1] - m->L_q) * edge.q / size_q : found[1];
-    m->K_p.d = m->L_d * derived->gain_per_L.d;
-    m->K_p.q = m->L_q * derived->gain_per_L.q;
+    table_place at;
+    at.size_q = pmsm_abs(i.q);
+    at.edge.d = pmsm_clamp(i.d, i_d_min, (pmsm_real)p->saturation_i_d_max_a);
+    at.edge.q = (at.size_q < i_q_max) ? at.size_q : i_q_max;
+    const uint32_t row =
+        left_node((at.edge.d - i_d_min) * derived->nodes_per_ampere.d, p->saturation_n_d, &at.right.d);
+    const uint32_t column = left_node(at.edge.q * derived->nodes_per_ampere.q, p->saturation_n_q, &at.right.q);
+    at.low = period->lut + derived->saturation_word + VALUES * (row * p->saturation_n_q + column);
+    at.high = at.low + VALUES * p->saturation_n_q;
+    return at;
 }
 
+static inline pmsm_real interpolate(const table_place *at, uint32_t k)
+{
+    const pmsm_real a = value_at(at->low, k);
+    const pmsm_real b = value_at(at->high, k);
+    const pmsm_real at_low = a + at->right.q * (value_at(at->low, VALUES + k) - a);
+    const pmsm_real at_high = b + at->right.q * (value_at(at->high, VALUES + k) - b);
+    return at_low + at->right.d * (at_high - at_low);
+}
+
+/* psi_q / i_q at any i_q. */
+static pmsm_real apparent_q(const table_place *at)
+{
+    const pmsm_real at_edge = interpolate(at, 1u);
+    if (at->size_q <= at->edge.q) {
+        return at_edge;
+    }
+    const pmsm_real L_q = interpolate(at, 3u);
+    return L_q + (at_edge - L_q) * at->edge.q / at->size_q;
+}
+
+static uint32_t is_inductance(pmsm_real L)
+{
+    return (L >= PMSM_C(0.99) * (pmsm_real)PMSM_INDUCTANCE_LEAST && L <= (pmsm_real)PMSM_INDUCTANCE_MOST) ? 1u : 0u;
+}
+
+/* Nodes are checked when a set is loaded; what a destroyed memory holds in one of them leaves all as it was. */
 void pmsm_saturate(pmsm_period *period, pmsm_dq i)
 {
-    read_table(period, i, &period->state->local);
-    period->magnetics = &period->state->local;
+    const pmsm_derived *derived = &period->state->derived;
+    pmsm_magnetics *local = &period->state->local;
+    const table_place at = find_place(period, i);
+    pmsm_magnetics m;
+    m.L_d = interpolate(&at, 2u);
+    m.L_q = interpolate(&at, 3u);
+    m.L_d_app = m.L_d; /* along the tangent: psi_f takes what is left, so that psi_d is the table's */
+    m.psi_f = interpolate(&at, 0u) - m.L_d * at.edge.d;
+    m.L_q_app = apparent_q(&at);
+    m.K_p.d = m.L_d * derived->gain_per_L.d;
+    m.K_p.q = m.L_q * derived->gain_per_L.q;
+    const uint32_t usable = is_inductance(m.L_d) & is_inductance(m.L_q) & is_inductance(m.L_q_app) &
+                            ((pmsm_abs(m.psi_f) <= FLUX_MOST) ? 1u : 0u);
+    if (usable != 0u) {
+        *local = m;
+    } else if (local->L_d == PMSM_C(0.0)) { /* there has been none */
+        *local = derived->nominal;
+    }
+    period->magnetics = local;
 }
 
 pmsm_dq pmsm_flux(const pmsm_period *period, pmsm_dq i)
 {
     const pmsm_magnetics *m = period->magnetics;
-    pmsm_magnetics there;
-    if (m == &period->state->local) {
-        read_table(period, i, &there);
-        m = &there;
+    if (m != &period->state->local) {
+        return pmsm_flux_here(m, i);
     }
-    const pmsm_dq psi = {m->psi_f + m->L_d_app * i.d, m->L_q_app * i.q};
-    return psi;
+    const table_place at = find_place(period, i);
+    pmsm_dq psi = {interpolate(&at, 0u), apparent_q(&at) * i.q};
+    if (i.d != at.edge.d) {
+        psi.d += interpolate(&at, 2u) * (i.d - at.edge.d);
+    }
+    return (pmsm_abs(psi.d) + pmsm_abs(psi.q) <= FLUX_MOST) ? psi : pmsm_flux_here(m, i);
 }

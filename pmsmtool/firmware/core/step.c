@@ -56,9 +56,12 @@ static void reset_controllers(pmsm_state *state, pmsm_real omega_M)
     state->omega_ref_ramped = omega_M;
     state->fw_count = 0u;
     state->fw_tau = PMSM_C(0.0);
+    state->fw_U_dc = PMSM_C(0.0);
+    state->U_dc_slow = PMSM_C(0.0);
     state->fw_empty = 0u;
     state->fw_multiplier = PMSM_C(0.0);
     state->fw_corner_state = 0u;
+    state->lut_cut = 0u;
     state->speed_count = 0u;
     state->polar = no_polar;
 }
@@ -109,6 +112,7 @@ static pmsm_dq current_request(pmsm_period *period)
 {
     const pmsm_reference *request = period->request;
     if (request->mode == PMSM_MODE_CURRENT) {
+        period->state->U_dc_slow = PMSM_C(0.0);
         const pmsm_dq asked = {request->i_d_ref, request->i_q_ref};
         return pmsm_limit_current(period, asked);
     }
@@ -128,7 +132,7 @@ static void follow_saturation(pmsm_period *period, pmsm_dq i)
 static void field_oriented(pmsm_period *period, pmsm_output *output)
 {
     if (period->state->derived.predicts != 0u) {
-        period->i_model = pmsm_predict_current(period);
+        pmsm_predict_current(period);
         follow_saturation(period, period->i_model);
     }
 #if PMSM_LAW_GOVERNOR
@@ -177,6 +181,7 @@ static void inject_only(pmsm_period *period, pmsm_output *output)
     period->u.d = period->request->u_d_inject;
     period->u.q = period->request->u_q_inject;
     pmsm_modulate(period, output);
+    period->state->U_dc_slow = PMSM_C(0.0);
     period->state->integrator.d = PMSM_C(0.0);
     period->state->integrator.q = PMSM_C(0.0);
     period->state->live.i_d_req = PMSM_C(0.0);
@@ -297,6 +302,7 @@ void pmsm_step(pmsm_state *state, const pmsm_params *params, const uint32_t *lut
     period.cosine_half = PMSM_C(0.0); /* not known yet */
     period.flags = 0u;
     period.steps = 0u;
+    period.looked = 0u;
     state->live.kappa = PMSM_C(1.0);
     state->live.binding = PMSM_BINDING_NONE;
     state->live.iterations = 0u;
