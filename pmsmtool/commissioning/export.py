@@ -18,7 +18,7 @@ from pmsmtool.drive_maps.dcf import Entry, new_dcf, write_concise
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.drive_maps.map_tables import encode_table, look_up_words
-from pmsmtool.drive_maps.sheet_check import contradictions, types_of
+from pmsmtool.drive_maps.sheet_check import contradictions, family_of_sheet, types_of
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.image import crc32, pack_image
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
@@ -27,6 +27,9 @@ from pmsmtool.plain_text import counted
 from pmsmtool.resources import data_folder
 
 CSV_HEAD = ("name", "value", "unit", "held", "object", "type", "bytes", "meaning", "not written because")
+
+MOST_NAMED = 8
+"""Rows that the refusal of another drive's file lists; they are all rows of a map where it is the wrong one."""
 
 
 def checked(wanted: ParameterSet) -> ParameterSet:
@@ -88,12 +91,17 @@ def dcf_file(
         base = (data_folder("firmware-params") / drive_map.name / f"{drive_map.name}.eds").read_bytes()
     encoded = drive_map.encode(checked(wanted))
     rows = [name for name in encoded if name in drive_map.cells]
-    wrong = contradictions(drive_map, types_of(parse_eds(base, where)), rows)
+    sheet = parse_eds(base, where)
+    wrong = contradictions(drive_map, types_of(sheet), rows)
     if wrong:
+        more = len(wrong) - MOST_NAMED
+        family = family_of_sheet(sheet)
+        its = "its map with --map" if family is None else f"--map {family.name}"
         raise ConfigError(
             f"the file contradicts {counted(len(wrong), 'row')} of the map {drive_map.name!r}",
-            where=where, violations=wrong, likely="the file belongs to another drive or firmware",
-            hint="give the EDS of the drive that the map is for, or its map with --map; nothing was written",
+            where=where, violations=[*wrong[:MOST_NAMED], *([f"and {more} more"] if more > 0 else [])],
+            likely="the file belongs to another drive or firmware",
+            hint=f"give the EDS of the drive that the map is for, or {its}; nothing was written",
         )  # fmt: skip
     values = {drive_map.address(name): data for name, data in encoded.items()}
     return new_dcf(base, values, node_id=node_id, node_name=wanted.name, where=where)

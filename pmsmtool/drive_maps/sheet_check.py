@@ -9,6 +9,7 @@ from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap, SignalCell
 from pmsmtool.drive_maps.eds import Eds, parse_integer
 from pmsmtool.drive_maps.motion_objects import MotionObject
+from pmsmtool.drive_maps.shipped_maps import family_of
 
 _IDENTITY = 0x1018
 _TYPE_NAMES = {row.code: row.name for row in DATA_TYPES.values()}
@@ -25,6 +26,12 @@ def other_identity(sheet: Eds, drive_map: DriveMap) -> str:
         if any(known)  # 0 in a map: no source stated it
     ]
     return f"the file is for {'; '.join(lines)}" if lines else ""
+
+
+def family_of_sheet(sheet: Eds) -> DriveMap | None:
+    """Return the shipped map for the drive of a data sheet, None where there is none or the sheet does not say."""
+    vendor, product = (next(_told(sheet, sub), stated) or 0 for sub, stated in ((1, sheet.vendor), (2, sheet.product)))
+    return family_of(vendor, product)
 
 
 def _told(sheet: Eds, sub: int) -> Iterator[int]:
