@@ -164,6 +164,22 @@ def test_a_cut_torque_is_sought_once() -> None:
     assert sizes == pytest.approx([20.0] * 40, rel=1e-5)
 
 
+def test_an_infinite_node_of_the_torque_axis_gives_a_current() -> None:
+    torque, speed = np.array([-100, -60, -20, 20, 60, 100]), np.linspace(0, 900, 5)
+    i_q = np.broadcast_to((torque / 2.46)[:, None], (6, 5))
+    lut = b"".join(np.asarray(x, dtype=f).tobytes() for x in (torque, speed, [210.0], 0 * i_q - 1.0, i_q))
+    layout = {"lut.format": 1, "lut.n_x": 6, "lut.n_y": 5, "lut.n_z": 1, "lut.axis_kind": 0, "motor.I_max_apk": 5.0}
+    loop = Loop(core(), tuned(field_weakening__mode=1) | layout, omega=40.0, lut=lut)
+    assert loop.lut is not None
+    for k in range(6):
+        for bits_of in (0x7F800000, 0xFF800000):
+            kept, loop.lut[k] = loop.lut[k], bits_of
+            for tau in (-90.0, 90.0, -30.0, 30.0):
+                live = loop.step(mode=MODE_TORQUE, tau_ref=tau)
+                assert math.isfinite(live.i_d_req + live.i_q_req) and loop.state.fault == 0
+            loop.lut[k] = kept
+
+
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_destroyed_axis_leaves_the_current_within_the_table(axis: int) -> None:
     """Nodes in disorder, as after a flipped bit: no weight outside 0 to 1, so no current beyond the corners'."""

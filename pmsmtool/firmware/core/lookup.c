@@ -58,7 +58,7 @@ static axis_place find(const uint32_t *axis, uint32_t count, pmsm_real x, uint32
     const pmsm_real left = node_at(axis, low);
     place.index = low;
     const pmsm_real weight = (x - left) / (node_at(axis, high) - left);
-    place.weight = (weight >= PMSM_C(0.0) && weight <= PMSM_C(1.0)) ? weight : PMSM_C(0.0); /* axis destroyed */
+    place.weight = (weight >= PMSM_C(0.0) && weight <= PMSM_C(1.0)) ? weight : PMSM_C(0.0);
     return place;
 }
 
@@ -322,8 +322,9 @@ static pmsm_dq cut(table_row *row, uint32_t k, row_node near, row_node far, uint
         inside = (known == 0u && low != high) ? look(row, low) : inside;
     }
     const pmsm_real x_low = node_at(row->axis, low);
-    if (x_low * row->x < PMSM_C(0.0)) { /* no torque lies between */
-        const pmsm_real share = x_low / (x_low - node_at(row->axis, high));
+    if (x_low * row->x < PMSM_C(0.0)) { /* no torque lies between, or a node is destroyed */
+        const pmsm_real place = x_low / (x_low - node_at(row->axis, high));
+        const pmsm_real share = (place >= PMSM_C(0.0) && place <= PMSM_C(1.0)) ? place : PMSM_C(0.0);
         inside.i.d += share * (outside.i.d - inside.i.d);
         inside.i.q += share * (outside.i.q - inside.i.q);
     }
