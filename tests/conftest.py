@@ -4,15 +4,19 @@
 from __future__ import annotations
 
 import ast
+import compileall
+import contextlib
 import gc
 import os
 import signal
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+from _pytest.pathlib import import_path
 from _pytest.runner import runtestprotocol
 
 # As the program does, before anything imports numpy. With a thread per processor in every worker, the threads spin for
@@ -49,6 +53,28 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PMSMTOOL_HOME", str(tmp_path_factory.mktemp("home")))
         yield
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the figures of a report with all their data, but not their SVG text, for chains whose test is not of it.
+
+    What a page draws is tested in ``tests/report``, ``tests/cli/test_report.py`` and by the README's first session.
+    """
+    monkeypatch.setattr("pmsmtool.report.figures.svg", lambda canvas: '<svg xmlns="http://www.w3.org/2000/svg"/>')
+
+
+def pytest_collection(session: pytest.Session) -> None:
+    """Begin with another share in every worker: in a new clone each compiled every test and module, for 12 s."""
+    worker = getattr(session.config, "workerinput", None)
+    if worker is None or session.config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
+        return
+    root, first, step = session.config.rootpath, int(worker["workerid"].removeprefix("gw")), worker["workercount"]
+    for path in sorted(Path(root, "pmsmtool").rglob("*.py"))[first::step]:
+        compileall.compile_file(path, quiet=2)
+    for path in sorted(Path(root, "tests").rglob("test_*.py"))[first::step]:
+        with contextlib.suppress(Exception, pytest.skip.Exception):  # an error is told when it is collected
+            import_path(path, mode="importlib", root=root, consider_namespace_packages=False)
 
 
 def pytest_collection_finish() -> None:

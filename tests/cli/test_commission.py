@@ -38,7 +38,7 @@ from pmsmtool.sim.bus import PmsmSimBus
 from tests.cli.conftest import Tool
 from tests.drive.served import serving
 
-pytestmark = pytest.mark.chain
+pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
 
 TOLERANCE = 0.01
 """Largest deviation of an identified value from the truth with ideal sensor gains; measured 0.2 % (benchmarks/

@@ -38,6 +38,7 @@ def drive(tmp_path: Path) -> Sequence[str]:
 
 
 @pytest.mark.chain
+@pytest.mark.usefixtures("undrawn")
 def test_the_same_move_with_stored_and_with_new_gains(tool: Tool, drive: Sequence[str]) -> None:
     code, printed, said = tool("move", *ASKED, *drive)
     assert code == 0, said

@@ -45,7 +45,7 @@ from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.simulated_machine import with_simulation
 from tests.commissioning.audience import Quiet, Told
 
-pytestmark = pytest.mark.chain
+pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
 
 PROFILE = data_folder("profiles") / "interior-2k2.toml"
 INJECT_OFF = 2e-3

@@ -38,7 +38,7 @@ from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
 
-pytestmark = pytest.mark.chain
+pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
 
 Pushed = tuple[MappedRecorderDrive, PulseResult, list[Trace]]
 

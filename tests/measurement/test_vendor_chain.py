@@ -30,7 +30,7 @@ from pmsmtool.sim.bus import PmsmSimBus
 from tests.commissioning.audience import Quiet, Told
 from tests.measurement.vendor_rig import PROFILE, TRUTH, channel, without_torque
 
-pytestmark = pytest.mark.chain
+pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
 
 
 @pytest.fixture(autouse=True)

@@ -61,7 +61,10 @@ class Installation:
 
 
 def install(folder: Path, *, editable: bool, compilers: bool) -> Installation:
-    """Install a copy of this checkout in a fresh environment, with or without the system's compilers."""
+    """Install a copy of this checkout in a fresh environment, by the system's compiler alone or without any.
+
+    The page of reports needs ziglang beside a compiler; that is what the environment of these tests was built with.
+    """
     sources = folder / "checkout"
     for name, path in wheel.source_files(ROOT).items():
         (sources / name).parent.mkdir(parents=True, exist_ok=True)
@@ -71,7 +74,9 @@ def install(folder: Path, *, editable: bool, compilers: bool) -> Installation:
     venv.create(folder / "environment", with_pip=False)
     python = folder / "environment" / "bin" / "python"
     env = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "CC")}
-    if not compilers:
+    if compilers:
+        env["CC"] = next(filter(shutil.which, CANDIDATES), "")
+    else:
         env["PATH"] = str(folder / "environment" / "bin")
         assert not any(shutil.which(name, path=env["PATH"]) for name in CANDIDATES)
     what = ["-e", str(sources)] if editable else [str(sources)]

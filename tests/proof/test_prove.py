@@ -45,7 +45,7 @@ from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RECORD, RunDirectory, Stage
 from pmsmtool.sim.kernel import Params
 
-pytestmark = pytest.mark.chain
+pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
 
 FEW, FEWER = ProofRequest(runs=32), ProofRequest(runs=16)
 """A third of the machines the tool draws; and a sixth, for a test that is alone with its prediction."""

@@ -125,7 +125,7 @@ def margins(loop: SampledLoop) -> LoopMargins:
         gain_margin=float(up.min()) if up.size else math.inf,
         gain_reduction=float(down.max()) if down.size else 0.0,
         delay_margin_s=float(np.min(lags / gain_crossings)) if lags.size else math.inf,
-        modulus_margin=_modulus_margin(loop),
+        modulus_margin=modulus_margin(loop),
         crossover_rad_s=float(gain_crossings[worst]) if worst >= 0 else math.nan,
         phase_crossover_rad_s=float(phase_crossings[factors == up.min()][0]) if up.size else math.nan,
         bandwidth_rad_s=_bandwidth(loop),
@@ -214,8 +214,8 @@ def _horner(coefficients: tuple[float, ...], z: NDArray[np.complex128]) -> NDArr
     return value
 
 
-def _modulus_margin(loop: SampledLoop) -> float:
-    """Least |1 + L| over the unit circle: the extrema of |D + N|^2 / |D|^2 are roots of a polynomial in c.
+def modulus_margin(loop: SampledLoop) -> float:
+    """Return the least |1 + L| over the unit circle: the extrema of |D + N|^2 / |D|^2 are roots of a polynomial in c.
 
     The roots of a slow loop lie too near 1 to be told apart. So a grid is looked at besides, and the least of both
     again between its neighbours.

@@ -19,7 +19,7 @@ from enum import StrEnum
 import numpy as np
 
 from pmsmtool.arrays import Array
-from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
+from pmsmtool.design.loops.sampled_loop import SampledLoop, margins, modulus_margin
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.two_masses import Mechanics, sampled
 
@@ -182,9 +182,9 @@ def slowed(gains: SpeedGains, paths: Sequence[SpeedPath]) -> SpeedGains:
     for k in range(_SLOWER_STEPS):
         share = _SLOWER**k
         slower = replace(gains, K_p=share * gains.K_p, K_i=share**2 * gains.K_i, omega_c=share * gains.omega_c)
-        found = [margins(speed_loop(slower, path)) for path in paths]
-        held = all(one.stable and one.modulus_margin >= ELASTIC_MODULUS for one in found)
-        if held and found[0].phase_margin_deg >= ELASTIC_PHASE_DEG:
+        loops = (speed_loop(slower, path) for path in paths)
+        held = all(modulus_margin(loop) >= ELASTIC_MODULUS and margins(loop).stable for loop in loops)
+        if held and margins(speed_loop(slower, paths[0])).phase_margin_deg >= ELASTIC_PHASE_DEG:
             return slower
     raise DesignInfeasible(
         "no speed loop keeps its margins with this elastic shaft",
