@@ -94,6 +94,7 @@ def test_same_run_same_bytes(made: Path, tmp_path: Path) -> None:
     assert (tmp_path / "one.html").read_bytes() == (tmp_path / "two.html").read_bytes()
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.chain
 def test_json_gives_the_verdict_on_stdout_alone(made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert program(["report", str(made), "--json", "-o", str(tmp_path / "r.html")]) == 0
@@ -122,6 +123,7 @@ def test_a_commissioning_of_one_stage_so_far_is_not_complete(tmp_path: Path) -> 
     assert report_page.verdict(run.path).word == "PARTIAL"
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.chain
 def test_a_failed_stage_makes_the_verdict(made: Path, tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
@@ -141,6 +143,7 @@ def test_the_loops_drawn_are_those_of_the_design(made: Path) -> None:
         assert again.gain_margin == pytest.approx(stated.gain_margin, rel=1e-9), name
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.chain
 @pytest.mark.parametrize(
     ("damage", "message"),
@@ -164,6 +167,7 @@ def test_a_damaged_run_is_named(
     assert not (folder / "report.html").exists()
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.chain
 def test_a_page_that_cannot_be_written_leaves_the_run_alone(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path: path.read_bytes() for path in made.rglob("*") if path.is_file() and path.name != "report.html"}
@@ -172,6 +176,7 @@ def test_a_page_that_cannot_be_written_leaves_the_run_alone(made: Path, capsys: 
     assert {path: path.read_bytes() for path in before} == before
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.chain
 def test_values_with_a_deviation_become_the_table(made: Path, tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
