@@ -130,8 +130,9 @@ def levenberg_marquardt(
         while True:
             delta = -np.linalg.solve(normal + damping * np.eye(len(x)), gradient) / columns
             trial = x + delta
-            r_trial = residual(trial)
-            cost_trial = float(r_trial @ r_trial)
+            with np.errstate(all="ignore"):  # a step that runs away has no finite cost and is taken back
+                r_trial = residual(trial)
+                cost_trial = float(r_trial @ r_trial)
             small = bool(np.all(np.abs(delta) <= tolerance * scale))
             if np.isfinite(cost_trial) and cost_trial <= cost:
                 gain = cost - cost_trial

@@ -167,16 +167,15 @@ class _Problem:
         return out
 
     def fit(self, x: Array, iterations: int = ITERATIONS) -> Fit:
-        with np.errstate(over="ignore", invalid="ignore"):  # a step that runs away has no finite cost and is refused
-            return levenberg_marquardt(
-                self,
-                x,
-                np.ones(len(x)),
-                iterations=iterations,
-                tolerance=STEP_TOLERANCE,
-                cost_tolerance=COST_TOLERANCE,
-                derivative=self.derivative,
-            )
+        return levenberg_marquardt(
+            self,
+            x,
+            np.ones(len(x)),
+            iterations=iterations,
+            tolerance=STEP_TOLERANCE,
+            cost_tolerance=COST_TOLERANCE,
+            derivative=self.derivative,
+        )
 
 
 def fit_axis(
