@@ -112,7 +112,7 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number("load_viscous_nms", "N m s", 0, 1e4, 0.0, "load torque per speed"),
     _number("J_load_kgm2", "kg m2", 0, 1e4, 0.0, "second mass behind an elastic shaft, 0 none"),
     _number("coupling_stiffness_nm_per_rad", "N m/rad", 0, 1e9, 0.0, "stiffness of the elastic shaft"),
-    _number("coupling_damping_nms_per_rad", "N m s/rad", 0, 1e6, 0.0, "damping of the elastic shaft"),
+    _number("coupling_damping_nms_per_rad", "N m s/rad", 0, 1e6, 0.0, "damping of the elastic shaft, 0: 1 %"),
     _number("backlash_rad", "rad", 0, 1, 0.0, "play of the elastic shaft, from end to end"),
     _choice("rotor", ("free", "locked", "driven"), "free", "free, held, or turned by a load machine"),
     _number("driven_rpm", "rpm", -1e6, 1e6, 0.0, "speed of a driven rotor"),

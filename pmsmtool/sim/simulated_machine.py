@@ -9,6 +9,7 @@ of switch and diode) is taken out of it for the phase, so that the loop is what 
 from __future__ import annotations
 
 import ctypes
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -17,6 +18,7 @@ from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.hall import hall_axis
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.two_masses import DAMPING
 from pmsmtool.sim.kernel import Application, Rotor, Setup, library
 from pmsmtool.units import RAD_S_PER_RPM
 
@@ -245,6 +247,9 @@ def _mechanics(out: Any, settings: Settings, violations: list[str]) -> None:
     out.coupling_damping = settings.number("coupling_damping_nms_per_rad")
     if out.J_load > 0.0 and out.coupling_stiffness <= 0.0:
         violations.append("J_load_kgm2 needs coupling_stiffness_nm_per_rad")
+    elif out.J_load > 0.0 and out.coupling_damping == 0.0:  # no shaft swings for ever
+        resonance_rad_s = math.sqrt(out.coupling_stiffness * (1.0 / out.J + 1.0 / out.J_load))
+        out.coupling_damping = 2.0 * DAMPING * out.coupling_stiffness / resonance_rad_s
 
 
 def _inverter(out: Any, settings: Settings, violations: list[str]) -> None:

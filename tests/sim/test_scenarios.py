@@ -268,6 +268,16 @@ def test_what_cannot_be_simulated_is_refused(changes, said):
     assert said in str(caught.value)
 
 
+def test_an_elastic_shaft_of_unstated_damping_does_not_swing_for_ever():
+    """1 % of critical damping, where 2 zeta w_r J_1 J_2 / (J_1 + J_2) is that of two masses; what is stated holds."""
+    spring = {"J_kgm2": 2e-3, "J_load_kgm2": 5e-3, "coupling_stiffness_nm_per_rad": 400.0}
+    common = 2e-3 * 5e-3 / 7e-3
+    setup, _ = build_setup(with_simulation(machine("interior-2k2"), spring))
+    assert setup.machine.coupling_damping == pytest.approx(0.02 * math.sqrt(400.0 / common) * common, rel=1e-12)
+    stated = {**spring, "coupling_damping_nms_per_rad": 1e-6}
+    assert build_setup(with_simulation(machine("interior-2k2"), stated))[0].machine.coupling_damping == 1e-6
+
+
 def test_every_drive_of_the_population_can_be_simulated():
     # 2.96 us of dead time, 86 pF and 0.24 mH ring longest of 8000 drives: 70 steps in a dead time
     build_setup(draw_drive(74814))
