@@ -200,7 +200,8 @@ def of_no_rigid_shaft(
     if response is not None and response.found and swing_hz:
         slow = response.found["resonance_hz"].value
         both = f"it swings at {slow:.3g} Hz by a small torque, at {swing_hz:.3g} Hz by pulses"
-        response = replace(response, found={}, inertia=None, reason=f"play, the response depends on the torque: {both}")
+        why = f"play, the response depends on the torque: {both}"
+        response = replace(response, found={}, inertia=None, shown_hz=0.0, reason=why)
         return None, _because(pushes.means(), f"{PLAY_FALLBACK}: {both}"), response
     small = None if response is None else response.inertia
     found = None
@@ -216,7 +217,8 @@ def of_no_rigid_shaft(
         check = cross_check("J_kgm2", "J_kgm2", small, whole)
         if not check.agrees:
             both = f"{small.value:.3g} kg m2 by a small torque, {whole.value:.3g} by pulses"
-            response = replace(response, found={}, inertia=None, reason=f"the shaft has play, or is not linear: {both}")
+            why = f"the shaft has play, or is not linear: {both}"
+            response = replace(response, found={}, inertia=None, shown_hz=0.0, reason=why)
             if check.difference > 0.0:
                 return None, {}, response
             why = f"{PLAY_FALLBACK}: {both}"

@@ -77,3 +77,19 @@ def test_a_resonance_stands_where_it_explains_half_as_much_as_a_faster_swing() -
     assert swing_of(both, torque) == pytest.approx(150.0, rel=FREQUENCY_LIMIT)
     assert swing_of(both, torque, 70.0, 1.0) == 0.0
     assert swing_of(pushes(150.0, 3.0), torque, 70.0, 1.0) == pytest.approx(150.0, rel=FREQUENCY_LIMIT)
+
+
+def test_a_load_that_bounces_in_its_play_swings_at_no_one_frequency() -> None:
+    """From 60 to 250 Hz within the push: one swing explains 0.32 of it, 18 Hz 0.03."""
+    bouncing = []
+    for p in pushes(150.0, 0.0):
+        bounce = 4e-3 * np.sin(2.0 * math.pi * (60.0 + 2600.0 * p.t_s) * p.t_s)
+        bouncing.append(Trace(p.t_s, {**p.signals, "theta_M_rad": p["theta_M_rad"] + bounce}, dict(p.units)))
+    assert 60.0 < swing_of(bouncing, torque, 18.0, 1.0) < 250.0
+    assert swing_of(bouncing, torque) == 0.0, "no resonance is known that it contradicts"
+
+
+def test_what_is_slowest_of_all_that_a_push_shows_is_friction_and_no_swing() -> None:
+    """Two turns of 55 Hz are in the push: 40 Hz look like them."""
+    assert swing_of(pushes(40.0, 3.0), torque) == 0.0
+    assert swing_of(pushes(65.0, 3.0), torque) == pytest.approx(65.0, rel=FREQUENCY_LIMIT)

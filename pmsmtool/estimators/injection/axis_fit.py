@@ -167,15 +167,8 @@ class _Problem:
         return out
 
     def fit(self, x: Array, iterations: int = ITERATIONS) -> Fit:
-        return levenberg_marquardt(
-            self,
-            x,
-            np.ones(len(x)),
-            iterations=iterations,
-            tolerance=STEP_TOLERANCE,
-            cost_tolerance=COST_TOLERANCE,
-            derivative=self.derivative,
-        )
+        size, stop = np.ones(len(x)), {"tolerance": STEP_TOLERANCE, "cost_tolerance": COST_TOLERANCE}
+        return levenberg_marquardt(self, x, size, iterations=iterations, derivative=self.derivative, **stop)
 
 
 def fit_axis(

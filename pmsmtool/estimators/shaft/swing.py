@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
 """At which frequency a shaft swings behind a torque pulse, beside what a rigid shaft under friction would do.
 
-The position of a push is fitted by a rigid shaft (place, speed, constant friction, integral of the torque), and by a
-damped swing beside it. A linear shaft swings at one frequency whatever the torque; one with play swings slower the
+The position of a push is fitted by a rigid shaft (place, speed, friction, integral of the torque), and by a damped
+swing beside it. A linear shaft swings at one frequency whatever the torque; one with play swings slower the
 smaller the torque is, for more of its way is in the play (Nordin and Gutman, Automatica 38, 2002,
 DOI 10.1016/S0005-1098(02)00047-X).
 """
@@ -20,6 +20,8 @@ from pmsmtool.trace import Trace
 
 ZETAS = (0.01, 0.05, 0.2)
 FREQUENCIES = 60
+SPEED_SPANS = 50
+"""Spans of a push that have one speed each, for the sign of the friction."""
 FASTEST = 0.2
 """Largest frequency, of the rate of rows."""
 LEAST_TURNS = 2.0
@@ -28,8 +30,9 @@ ABOVE = 2.0
 """Frequency of a large torque, of that of a small one, from which on it is another."""
 CLEAR = 0.5
 """Share of what a rigid shaft leaves that one swing must explain before it says anything, and share of that which the
-frequency of the small torque must explain. A gear with 1.1 degrees of play: 0.75 at 140 Hz, 0.21 at the 31 Hz of a
-small torque."""
+frequency of the small torque must explain (a gear with 1.1 degrees of play: 0.75 at 140 Hz, 0.21 at its 31 Hz)."""
+FAINT, BOUNCING = 0.1, 0.2
+"""The same where the latter explains next to nothing (another gear: 0.006, and 0.24): a bounce does not decay so."""
 
 
 def swing_of(pushes: Sequence[Trace], torque: Torque, resonance_hz: float = 0.0, doubt_hz: float = 0.0) -> float:
@@ -50,12 +53,13 @@ def swing_of(pushes: Sequence[Trace], torque: Torque, resonance_hz: float = 0.0,
     first = max(LEAST_TURNS / longest, ABOVE * resonance_hz)
     if first >= highest:
         return 0.0
-    frequencies = np.geomspace(first, highest, FREQUENCIES)
-    shares = [explained(float(hz)) for hz in frequencies]
-    best = int(np.argmax(shares))
+    tried = [float(hz) for hz in np.geomspace(first, highest, FREQUENCIES)]
+    most, best_hz = max((explained(hz), hz) for hz in tried)
     near = np.linspace(resonance_hz - doubt_hz, resonance_hz + doubt_hz, 5) if resonance_hz > 0.0 else ()
     claimed = max((explained(float(hz)) for hz in near), default=0.0)
-    return float(frequencies[best]) if shares[best] >= CLEAR and claimed < CLEAR * shares[best] else 0.0
+    clear = most >= CLEAR and claimed < CLEAR * most
+    bounces = resonance_hz > 0.0 and most >= BOUNCING and claimed < FAINT * most
+    return best_hz if best_hz > tried[0] and (clear or bounces) else 0.0  # the slowest: friction, no swing
 
 
 def _explained(pushes: Sequence[Trace], torque: Torque) -> Callable[[float], float]:
@@ -63,10 +67,13 @@ def _explained(pushes: Sequence[Trace], torque: Torque) -> Callable[[float], flo
     parts = []
     for push in pushes:
         t = push.t_s - push.t_s[0]
-        moved = np.cumsum(np.cumsum(torque(push["i_d_a"], push["i_q_a"])))
-        x = t / t[-1]
-        Q, _ = np.linalg.qr(np.stack([np.ones_like(x), x, x * x, moved / np.max(np.abs(moved))], axis=1))
-        parts.append((t, Q, push["theta_M_rad"] - Q @ (Q.T @ push["theta_M_rad"])))
+        theta, amperes = push["theta_M_rad"], (push["i_d_a"], push["i_q_a"])
+        k, half = np.arange(len(theta)), 1 + len(theta) // (2 * SPEED_SPANS)
+        turning = np.sign(theta[np.minimum(k + half, k[-1])] - theta[np.maximum(k - half, 0)])
+        ways = (np.cumsum(np.cumsum(drive)) for drive in (torque(*amperes), turning))
+        rigid = np.stack([np.ones_like(t), t, *ways, np.cumsum(theta - theta[0])], axis=1)
+        Q, _ = np.linalg.qr(rigid / np.max(np.abs(rigid), axis=0))
+        parts.append((t, Q, theta - Q @ (Q.T @ theta)))
     left = sum(float(rest @ rest) for _, _, rest in parts)
 
     def explained(hz: float) -> float:
