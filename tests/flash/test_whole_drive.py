@@ -195,7 +195,10 @@ def test_the_file_of_another_maker_is_refused(tmp_path: Path, monkeypatch: pytes
     assert not (tmp_path / "drive.json").exists()
 
 
-OTHERS = "[1017]\nParameterName=Heartbeat\nDataType=0x0006\nAccessType=rw\nDefaultValue=0\n"
+OTHERS = "".join(
+    f"[{index}]\nParameterName={name}\nDataType=0x0006\nAccessType=rw\nDefaultValue=0\n"
+    for index, name in (("1017", "Heartbeat"), ("6040", "Controlword"), ("6041", "Statusword"))
+)
 
 
 def test_a_drive_that_cannot_store_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -221,7 +221,7 @@ def position_gain(gains: SpeedGains, path: SpeedPath) -> tuple[float, float]:
         K_p = min(K_p, float(1.0 / (POSITION_GAIN * np.abs(unit[past]).max())))
     while np.abs(1.0 + K_p * unit).min() < POSITION_MODULUS:
         K_p *= _GAIN_STEP
-    return K_p, float(omega[np.abs(K_p * unit) >= 1.0].max())
+    return K_p, float(omega[np.abs(K_p * unit) >= 1.0].max(initial=min(K_p, omega[0])))
 
 
 def notch_coefficients(notch: Notch, T: float) -> tuple[tuple[float, ...], tuple[float, ...]]:

@@ -26,13 +26,13 @@ FASTEST = 0.2
 """Largest frequency, of the rate of rows."""
 LEAST_TURNS = 2.0
 """Swings within a push, below which friction and speed look like one."""
-ABOVE = 2.0
-"""Frequency of a large torque, of that of a small one, from which on it is another."""
+ABOVE, NEAR = 2.0, 1.2
+"""Frequency of a large torque, of that of a small one, from which on it is another; NEAR where that shows nothing."""
 CLEAR = 0.5
 """Share of what a rigid shaft leaves that one swing must explain before it says anything, and share of that which the
 frequency of the small torque must explain (a gear with 1.1 degrees of play: 0.75 at 140 Hz, 0.21 at its 31 Hz)."""
 FAINT, BOUNCING = 0.1, 0.2
-"""The same where the latter explains next to nothing (another gear: 0.006, and 0.24): a bounce does not decay so."""
+"""What is next to nothing, and what the other must then explain (0.006 and 0.24): a bounce does not decay so."""
 
 
 def swing_of(pushes: Sequence[Trace], torque: Torque, resonance_hz: float = 0.0, doubt_hz: float = 0.0) -> float:
@@ -50,14 +50,14 @@ def swing_of(pushes: Sequence[Trace], torque: Torque, resonance_hz: float = 0.0,
     explained = _explained(pushes, torque)
     longest = max(float(push.t_s[-1] - push.t_s[0]) for push in pushes)
     highest = FASTEST / max(push.period_s for push in pushes)
-    first = max(LEAST_TURNS / longest, ABOVE * resonance_hz)
+    first = max(LEAST_TURNS / longest, NEAR * resonance_hz)
     if first >= highest:
         return 0.0
     tried = [float(hz) for hz in np.geomspace(first, highest, FREQUENCIES)]
     most, best_hz = max((explained(hz), hz) for hz in tried)
     near = np.linspace(resonance_hz - doubt_hz, resonance_hz + doubt_hz, 5) if resonance_hz > 0.0 else ()
     claimed = max((explained(float(hz)) for hz in near), default=0.0)
-    clear = most >= CLEAR and claimed < CLEAR * most
+    clear = most >= CLEAR and claimed < CLEAR * most and best_hz >= ABOVE * resonance_hz
     bounces = resonance_hz > 0.0 and most >= BOUNCING and claimed < FAINT * most
     return best_hz if best_hz > tried[0] and (clear or bounces) else 0.0  # the slowest: friction, no swing
 
