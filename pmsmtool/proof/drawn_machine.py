@@ -11,7 +11,14 @@ from pmsmtool.design.tolerance import NORMAL_95, Samples
 from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import iron_drag
-from pmsmtool.machine.two_masses import ZETA_FACTOR, by_more_torque, doubt, hides_play, mechanics_of
+from pmsmtool.machine.two_masses import (
+    ZETA_FACTOR,
+    by_more_torque,
+    damping_nms_per_rad,
+    doubt,
+    hides_play,
+    mechanics_of,
+)
 from pmsmtool.sim.kernel import Setup, library
 from pmsmtool.sim.simulated_machine import MODELS, SHAPES
 from pmsmtool.units import rad_s_from_rpm
@@ -174,7 +181,7 @@ def _draw_elastic_shaft(setup: Setup, machine: MachineFile, rng: np.random.Gener
     out.J -= out.J_load
     out.coupling_stiffness = out.J_load * w_a**2
     zeta = shaft.zeta * math.exp(rng.uniform(-1.0, 1.0) * math.log(ZETA_FACTOR))
-    out.coupling_damping = 2.0 * zeta * out.coupling_stiffness / w_r
+    out.coupling_damping = damping_nms_per_rad(out.coupling_stiffness, w_r, zeta)
 
 
 def _draw_shaft_effects(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:

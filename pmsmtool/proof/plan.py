@@ -16,7 +16,7 @@ from pmsmtool.identification.frequency_response import NOTHING, RIGID, SHOWN
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, MEAN_FALLBACK, PLAY_FALLBACK
 from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.machine.two_masses import SWING, UNSEEN
+from pmsmtool.machine.two_masses import CERTAIN_ZETA, SWING, UNSEEN, hides_play
 from pmsmtool.units import RAD_S_PER_RPM
 
 RPM = RAD_S_PER_RPM
@@ -326,7 +326,8 @@ def _unmodelled(design: Design) -> str:
     """Return why no response of the speed loop is predicted; empty where identification says how the shaft moves."""
     machine = design.machine
     inertia = machine.estimates.get("J_kgm2")
-    if inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK):
+    told = inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK)
+    if told or hides_play(machine, CERTAIN_ZETA):
         return "the shaft has play, which nothing predicts"
     if SWING in machine.conditions:
         return "torque pulses swing the shaft as no known resonance does: play, or an elastic coupling"

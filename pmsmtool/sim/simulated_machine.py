@@ -18,7 +18,7 @@ from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.hall import hall_axis
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.machine.two_masses import DAMPING
+from pmsmtool.machine.two_masses import damping_nms_per_rad
 from pmsmtool.sim.kernel import Application, Rotor, Setup, library
 from pmsmtool.units import RAD_S_PER_RPM
 
@@ -249,7 +249,7 @@ def _mechanics(out: Any, settings: Settings, violations: list[str]) -> None:
         violations.append("J_load_kgm2 needs coupling_stiffness_nm_per_rad")
     elif out.J_load > 0.0 and out.coupling_damping == 0.0:  # no shaft swings for ever
         resonance_rad_s = math.sqrt(out.coupling_stiffness * (1.0 / out.J + 1.0 / out.J_load))
-        out.coupling_damping = 2.0 * DAMPING * out.coupling_stiffness / resonance_rad_s
+        out.coupling_damping = damping_nms_per_rad(out.coupling_stiffness, resonance_rad_s)
 
 
 def _inverter(out: Any, settings: Settings, violations: list[str]) -> None:
