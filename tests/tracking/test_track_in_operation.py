@@ -203,7 +203,7 @@ def test_what_was_observed_until_an_interrupt_is_kept(
     before = stored(node)
     arguments = ["track", "-i", "pmsmsim", "-c", CHANNEL, "--by", by, "--for", "60s"]
     with monkeypatch.context() as patched:
-        interrupt_at(bus.clock.now() + 8.0, patched)
+        interrupt_at(bus.clock.now() + 12.0, patched)  # at 8 s the innovations are within 4 % of what is refused
         assert program(arguments) == 130
     (path,) = Path("runs").iterdir()
     told = capsys.readouterr().err
@@ -216,7 +216,7 @@ def test_what_was_observed_until_an_interrupt_is_kept(
     assert [(stage.name, stage.status) for stage in record.stages] == [("track", "interrupted")]
     assert program(["track", "psi", "--replay", str(path), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert 5.0 < found["t_s"][-1] - found["t_s"][0] < 7.7
+    assert 9.0 < found["t_s"][-1] - found["t_s"][0] < 11.7
     psi = found["values"]["psi_f_wb"]
     assert abs(psi["value"][-1] - PSI_F_WB) < 3.0 * psi["std"][-1]
 
