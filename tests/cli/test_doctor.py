@@ -70,6 +70,7 @@ def test_a_bounded_call_gives_back_and_raises() -> None:
         in_time(lambda: {}[1], 1.0)  # type: ignore[index]
 
 
+@pytest.mark.chain
 def test_python_cans_complaints_are_for_verbose(tmp_path: Path) -> None:
     """The module of the seeedstudio adapter complains under a logger of its own, also when another one is meant."""
     if any(each.name == "seeedstudio" and each.ready for each in adapters()):

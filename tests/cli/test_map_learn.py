@@ -94,6 +94,7 @@ def bench(tool: Tool, tmp_path: Path) -> Any:
     made.holder.close()
 
 
+@pytest.mark.chain
 def test_learned_gains_are_the_drawn_ones_and_go_into_a_map(bench: Bench, tool: Tool, tmp_path: Path) -> None:
     before = bench.counts()
     code, printed, said = bench.learn(tool, "-o", "mine.toml", "--json")
@@ -144,6 +145,7 @@ def test_refused_before_anything_is_written(tool: Tool, tmp_path: Path) -> None:
         assert not any_left()
 
 
+@pytest.mark.chain
 def test_killed_with_a_changed_gain_the_next_connection_restores(
     bench: Bench, tool: Tool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

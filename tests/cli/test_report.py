@@ -300,6 +300,7 @@ def test_the_page_as_pdf(made: Path) -> None:
     (made / "report.pdf").unlink()
 
 
+@pytest.mark.chain
 def test_it_says_on_a_terminal_that_it_works(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

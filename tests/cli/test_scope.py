@@ -40,6 +40,7 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 # ---- the command -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.chain
 @pytest.mark.usefixtures("at_once")
 @pytest.mark.parametrize("suffix", ["csv", "npz"])
 def test_it_leaves_a_trace_of_what_was_kept(tool: Tool, suffix: str) -> None:
@@ -243,6 +244,7 @@ def test_what_is_no_request_is_no_news(capfd: pytest.CaptureFixture[str]) -> Non
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.mark.chain
 def test_who_does_not_read_or_goes_away_slows_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten that ask and never read, ten that vanish, and more that never ask: one browser sees every sample."""
     monkeypatch.setattr(live_server._Request, "timeout", 0.5)
@@ -363,6 +365,7 @@ def acted(*acts: tuple[str, str, Any]) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.chain
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node to run the page's script in")
 def test_cursors_zoom_and_trigger_of_the_page() -> None:
     """The canvas draws from 64 to 892 px: 20 s of it at first, so 207 px are 5 s."""

@@ -108,6 +108,7 @@ def test_a_browser_shows_the_step_and_follows_a_slider(design: Design, tmp_path:
     assert done.stdout.count('stroke="#1f5fa8"') == 2 and 'id="recompute-panel" hidden' not in done.stdout
 
 
+@pytest.mark.chain
 def test_what_a_page_cannot_compute_is_said(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
     if native.page_module() is not None:
         assert "saturates" in recomputed(profile("saturated-pmsyrm"))["missing"]

@@ -32,6 +32,7 @@ REACHED = (29, 33, 35)
 """Machines with constant inductances whose speed is reachable; the last one had a gap of 6e-3."""
 
 
+@pytest.mark.chain
 def test_random_linear_machines_against_all_roots() -> None:
     tally = Tally()
     for number in range(MACHINES):

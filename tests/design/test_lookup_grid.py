@@ -498,6 +498,7 @@ def test_capacity_is_the_drives() -> None:
     assert isinstance(interpolation_error(made("interior-2k2").table), InterpolationError)
 
 
+@pytest.mark.chain
 def test_a_table_leaves_room_for_the_saturation_table() -> None:
     """75 x 53 nodes in float32 need 8079 words, with the saturation table 8275: the drive refused the set of `tune`."""
     source = draw("saturated", 8601)

@@ -202,6 +202,7 @@ def test_a_speed_loop_is_as_slow_as_an_elastic_shaft_needs() -> None:
     assert slowed(rigid, [path()]) == rigid, "a rigid shaft needs nothing"
 
 
+@pytest.mark.chain
 def test_a_design_says_why_its_speed_loop_is_slow() -> None:
     """Before, a gear with play was given 1.5 Hz without a word."""
     rigid = load_machine_file("interior-2k2")

@@ -68,6 +68,7 @@ def test_nothing_is_found_where_nothing_repeats() -> None:
     assert not found.encoder_rad and not found.acceleration_rad_s2 and found.turns > 5.0
 
 
+@pytest.mark.chain
 def test_cogging_of_two_orders_and_an_encoder_off_centre_are_told_apart() -> None:
     cogging, encoder = {12: 30.0 * np.exp(0.7j), 6: 6.0 * np.exp(-2.0j)}, {1: 3e-3 * np.exp(1.1j)}
     traces = [coasting(start, cogging, encoder) for start in (65.0, -70.0)]

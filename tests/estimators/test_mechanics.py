@@ -249,6 +249,7 @@ def test_a_push_from_rest_whose_current_rises_late_is_fitted() -> None:
         assert found.J.value == pytest.approx(J, rel=2e-3) and found.tau_c.value == pytest.approx(TAU_C, rel=0.02)
 
 
+@pytest.mark.chain
 def test_a_step_may_meet_the_voltage_limit_and_the_rest_may_not() -> None:
     good = run_of(np.random.default_rng(3))
     flagged = np.zeros(ROWS)
@@ -416,6 +417,7 @@ def test_a_short_way_over_fine_cogging_and_with_wrong_sensors_keeps_the_inertia(
     assert found.J.std < 0.03 * found.J.value
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("effect", [{"tilt": 3e-3}, {"friction": 0.15}, {"encoder": 6e-3}, {}])
 def test_what_repeats_with_the_angle_or_grows_with_the_speed_is_no_friction(effect: dict[str, float]) -> None:
     """Before: tau_c 11 deviations (8 %) off with friction over the angle, B 25 (20 %) by the encoder, 3 by the tilt."""

@@ -101,6 +101,7 @@ def test_accuracy_and_coverage_over_drives() -> None:
     assert np.median(widths[easy]) < 4e-3  # an interval that says nothing would cover, too
 
 
+@pytest.mark.chain
 def test_a_simpler_formula_is_ten_times_worse_on_the_same_levels() -> None:
     rng = np.random.default_rng(1)
     d = draw(30, rng)
@@ -114,6 +115,7 @@ def test_a_simpler_formula_is_ten_times_worse_on_the_same_levels() -> None:
     assert np.median(single) > 0.2
 
 
+@pytest.mark.chain
 def test_twelve_kelvin_of_heating_do_not_matter() -> None:
     errors, _, hardness, results = summary(20, 3, heating_k=12.0)
     easy = hardness < 3.0
@@ -121,6 +123,7 @@ def test_twelve_kelvin_of_heating_do_not_matter() -> None:
     assert results[0].R_s.T_c == pytest.approx(26.0, abs=0.5)
 
 
+@pytest.mark.chain
 def test_without_a_temperature_sensor_the_value_belongs_to_the_mean_heating() -> None:
     rng = np.random.default_rng(4)
     d = draw(20, rng)
@@ -162,6 +165,7 @@ def replace_inverter(d: Drives) -> Drives:
     return d
 
 
+@pytest.mark.chain
 def test_the_inverter_curve_is_the_one_of_the_plant() -> None:
     rng = np.random.default_rng(6)
     d = draw(12, rng)

@@ -64,6 +64,7 @@ def test_only_the_laws_in_use_are_written(law: str) -> None:
     assert set(files) < set(exported(ALONE[law], all_laws=True))
 
 
+@pytest.mark.chain
 @needs_linux_compiler
 @pytest.mark.parametrize(
     ("law", "optimised"), [("none", "-O0"), ("polar control", "-O1"), ("reference governor", "-O2")]
@@ -82,6 +83,7 @@ def test_it_links_without_a_c_library(law: str, optimised: str, tmp_path: Path) 
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.chain
 @needs_linux_compiler
 def test_a_set_for_a_law_that_was_left_out_is_refused(tmp_path: Path) -> None:
     """The image check of a core without polar control takes its own set, and no polar one."""
@@ -100,6 +102,7 @@ def test_a_set_for_a_law_that_was_left_out_is_refused(tmp_path: Path) -> None:
     assert subprocess.run([tmp_path / "check"], check=False).returncode == 5, "PMSM_IMAGE_OK, PMSM_IMAGE_RANGE"
 
 
+@pytest.mark.chain
 @needs_linux_compiler
 @pytest.mark.parametrize("changed", [False, True], ids=["as exported", "a constant changed by hand"])
 def test_the_example_that_the_page_names_checks_the_constants(changed: bool, tmp_path: Path) -> None:

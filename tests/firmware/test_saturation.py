@@ -92,6 +92,7 @@ def test_a_table_of_one_inductance_controls_like_none(governor: str) -> None:
     assert np.hypot(*traces[0][:, -1]) > I_nom
 
 
+@pytest.mark.chain
 def test_steps_of_a_saturated_machine_settle_like_those_of_others() -> None:
     source, params = saturated(), designed()
     for rpm, points, limit in (
@@ -104,6 +105,7 @@ def test_steps_of_a_saturated_machine_settle_like_those_of_others() -> None:
         assert np.hypot(*i).max() < 1.05 * 20.0
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("seed", "rpm", "start", "target"),
     [

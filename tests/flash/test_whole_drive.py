@@ -159,6 +159,7 @@ def tool(*arguments: str) -> Result:
     return CliRunner().invoke(cli, [*arguments])
 
 
+@pytest.mark.chain
 def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settle(tmp_path, monkeypatch)
     path = write_eds(tmp_path / "x.eds", ROWS)

@@ -94,6 +94,7 @@ def test_a_drive_that_is_off_and_takes_no_controlword_is_off(tool: Tool) -> None
     assert code in (4, 9) and "NOT CONFIRMED" not in said, said
 
 
+@pytest.mark.chain
 def test_what_the_drive_cannot_hold_is_said(tool: Tool) -> None:
     rows = tuple(row for row in faulhaber() if row[0] != 0x608F)
     code, said = commissioned(tool, (*rows, (0x608F, 1, "U32", "rw", "2048")), {(0x608F, 1): (1, 65535)})

@@ -107,6 +107,7 @@ def run(harmonics: dict[int, complex], V_dead: float, speeds: tuple[float, ...] 
     return records(w, i_d, harmonics, V_dead)
 
 
+@pytest.mark.chain
 def test_harmonics_come_with_amplitude_and_phase_beside_a_dead_time() -> None:
     """2 % and 0.8 % of the back-EMF, beside a dead time whose measured curve is 20 % off."""
     true = {5: cmath.rect(0.02 * PSI / 5.0, 0.9), 7: cmath.rect(0.008 * PSI / 7.0, -2.0)}

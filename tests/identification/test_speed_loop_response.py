@@ -54,6 +54,7 @@ def staircase(bias: float, step: float) -> list[tuple[float, float]]:
     return steps
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("a", "b", "filter_s", "every", "latency_s"),
     [(40.0, 320.0, 8e-4, 5, 5e-4), (110.0, 2400.0, 3e-4, 2, 1.7e-3)],
