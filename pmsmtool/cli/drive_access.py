@@ -70,6 +70,16 @@ def read_map(path: Path | None) -> DriveMap:
     return parse_drive_map(read_text(path, hint=hint), str(path))
 
 
+def map_of_drive(bus: BusOptions, map_file: Path | None) -> DriveMap:
+    """Return the map that is given, else the one for the drive that answers: its family's, or that of CiA 402."""
+    from pmsmtool.measurement.capabilities import choose_map
+
+    if map_file is not None:
+        return read_map(map_file)
+    with open_node(bus, within_s=LOOKING_S) as node:
+        return choose_map(node.identity(), None)
+
+
 def rehearsal_bus(
     bus: BusOptions, *, eds: str | None, family: str | None = None, machine: Path | None = None
 ) -> BusOptions:

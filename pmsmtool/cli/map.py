@@ -12,14 +12,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import claimed_node, map_option, read_map
+from pmsmtool.cli.drive_access import claimed_node, map_of_drive, map_option
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
-    from pmsmtool.bus.connection import Connection
     from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
-    from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.measurement.learn_gains import GainObject, LearnedLoop
 
@@ -93,9 +91,9 @@ def learn_command(
             "the scale of a gain rests on the inertia, and the speed limit on the largest speed",
             where=f"{machine_path}: [machine]", hint="add J_kgm2 and n_max_rpm",
         )  # fmt: skip
+    drive_map = map_of_drive(bus, map_file)
     with bus.connect() as connection:
-        node_id = claimed_node(connection, bus.node)
-        drive = SpeedLoopDrive(connection, node_id, drive_map=_map_of(connection, node_id, map_file))
+        drive = SpeedLoopDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
         node = drive.node
         check_motion(node.map, drive.identity)
         found = {}
@@ -140,21 +138,6 @@ def _addresses(names: tuple[str, ...]) -> dict[str, tuple[int, int] | None]:
             )
         asked[name] = (int(match[1], 16), int(match[2] or "0", 16)) if match else None
     return asked or dict.fromkeys(STANDARD)
-
-
-def _map_of(connection: Connection, node_id: int, map_file: Path | None) -> DriveMap:
-    """Return the map that is given, else the shipped one that names the drive, else the standard's."""
-    from pmsmtool.drive.drive_node import DriveNode
-    from pmsmtool.drive_maps.shipped_maps import family_of, load_family
-
-    if map_file is not None:
-        return read_map(map_file)
-    node = DriveNode(connection, node_id)
-    try:
-        identity = node.identity()
-    finally:
-        node.close()
-    return family_of(*identity.vendor_product) or load_family("cia402")
 
 
 def _tell(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import LOOKING_S, claimed_node, map_option, new_run, open_node, read_map, runs_option
+from pmsmtool.cli.drive_access import claimed_node, map_of_drive, map_option, new_run, runs_option
 from pmsmtool.cli.options import (
     DURATION,
     FILE,
@@ -28,7 +28,6 @@ from pmsmtool.cli.output import Output, table
 if TYPE_CHECKING:
     from pmsmtool.axis.move import MoveResult
     from pmsmtool.drive.position_drive import PositionDrive
-    from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.machine.parameters import Estimate
     from pmsmtool.run_directory import RunDirectory
@@ -98,7 +97,7 @@ def move_command(
         raise ConfigError("--by 0 moves nothing", hint="give a way, e.g. --by 90deg")
     source = None if machine is None else load_machine_file(machine)
     times = times or (1 if source is None else IDENTIFY_TIMES)
-    drive_map = _map_of(bus, map_file)
+    drive_map = map_of_drive(bus, map_file)
     profile = _profile(design, speed_rad_s, acceleration)
     with bus.connect() as connection:
         drive = PositionDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
@@ -153,16 +152,6 @@ def move_command(
     data = {"run": run.path, "move": asdict(found), "gains": gains, "lent": lent, "profile": counts, "identified": told}
     out.result("move", data, lambda: [*_lines(found), *_told(told)])
     out.note(f"run: {run.path}")
-
-
-def _map_of(bus: BusOptions, map_file: Path | None) -> DriveMap:
-    """Return the map that is given, else the one for the drive that answers."""
-    from pmsmtool.measurement.capabilities import choose_map
-
-    if map_file is not None:
-        return read_map(map_file)
-    with open_node(bus, within_s=LOOKING_S) as node:
-        return choose_map(node.identity(), None)
 
 
 IDENTIFY_TIMES = 4

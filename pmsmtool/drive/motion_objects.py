@@ -352,7 +352,7 @@ def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, floa
 
 
 def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
-    """Return what the drive does not keep by itself, or keeps too well, one line each, with what replaces it."""
+    """Return the limits that the drive lacks, or holds far below its rated current, one line each with what to do."""
     lines = []
     for limit in current_limits(node, rated):
         held = allowed(node, iter((limit,)))

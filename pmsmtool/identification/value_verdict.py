@@ -83,7 +83,10 @@ def summary_of(evaluation: Evaluation, found: Mapping[str, Estimate], asked: Seq
     )
     refused = None if "frf" in asked else evaluation.refused.get("frf")
     response = frequency_response.response_summary(evaluation.frequency_response, refused)
-    return values + flux_map.map_summary(evaluation.flux_map) + response
+    reversed_ = evaluation.encoder is not None and evaluation.encoder.direction < 0
+    sign = "; encoder counts against the phase order (two motor leads or its tracks swapped): taken over"
+    summary = values + flux_map.map_summary(evaluation.flux_map) + response + (sign if reversed_ else "")
+    return summary.removeprefix("; ")
 
 
 def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:

@@ -31,13 +31,13 @@ def headline(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[str]]:
     first = [f"CONTRADICTION ACCEPTED: {row['text']}" for row in rows if row["verdict"] == "accepted"]
     by_source: dict[str, list[str]] = {}
     for name, source in unchecked(rows).items():
-        by_source.setdefault(source, []).append(SHORT.get(name, name))
+        by_source.setdefault(source, []).append(name)
     return first, [not_checked(names, source) for source, names in by_source.items()]
 
 
 def not_checked(names: Iterable[str], source: str) -> str:
     """Return that values were taken from a source and not measured."""
-    return f"NOT CHECKED ({source}): {', '.join(names)}"
+    return f"NOT CHECKED ({source}): {', '.join(SHORT.get(name, name) for name in names)}"
 
 
 def table_cells(rows: Iterable[Mapping[str, Any]]) -> list[tuple[str, str, str, str, str, str]]:

@@ -66,6 +66,7 @@ def test_found_and_taken_over_without_a_fault(case: str, level: str, tool: Tool)
         if level != "standard":  # whose chain has no whole machine file
             encoder = load_machine_file(folder / "machine.toml").encoder
             assert encoder.direction == (-1 if truth.flag("encoder_reversed") else 1)
+            assert ("against the phase order" in (folder / "run.json").read_text()) == (encoder.direction < 0)
     if "encoder" in quantities:
         assert found["direction"] == (-1 if truth.flag("encoder_reversed") else 1)
         off = math.remainder(found["offset_rad"] - truth.number("encoder_offset_rad"), 2.0 * math.pi)

@@ -238,7 +238,7 @@ def test_a_maker_whom_no_map_names_is_not_told_of_another_map(tool: Tool) -> Non
     code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "monitor", "-g", "speeed")
     assert code == 9 and "there is no live quantity of that name" in said and "theta_m_rad" in said
     code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=known.eds", "--yes", "flash-params", "design.toml")
-    assert code == 2 and "add --map epos4" in said
+    assert code == 9 and "of family epos4" in said and "`flash-params --no-store`" in said
 
 
 def test_a_gain_that_the_drive_lacks_is_asked_for_by_its_address(tool: Tool) -> None:

@@ -87,7 +87,7 @@ def test_commission_of_the_vendor_level_ends_green_with_what_it_gives(tmp_path: 
     }  # what a closed drive leaves open has its own tests
     found = verdict(run.path)
     assert found.word == "PARTIAL" and found.simulated
-    assert "NOT CHECKED (the drive's own measurement, without an interval): pole_pairs, R_s_ohm" in found.headline
+    assert "NOT CHECKED (the drive's own measurement, without an interval): pole pairs, R" in found.headline
     machine = load_machine_file(run.path / "machine.toml")
     assert machine.estimates["psi_f_wb"].source == "vendor" and "psi_f_wb" not in machine.std
     assert machine.machine.J_kgm2 == TRUTH.J_kgm2  # given: nothing pushed the shaft
