@@ -311,8 +311,8 @@ def main() -> int:
     nodes, moved, told = counted(rows)
     sums = [
         f"{moved} of {nodes} drives moved; {told} gave J/psi, by `identify` alone or with the pole pairs of the "
-        "machine file in `commission`; "
-        f"{'every' if good else 'NOT every'} truth within its interval; {judged} rows of maps counted in the node's "
+        "machine file in `commission`. "
+        f"{'Every' if good else 'NOT every'} truth is within its interval. {judged} rows of maps counted in the node's "
         f"own units, {'none' if good else 'SOME'} wrong."
     ]
     print(*sums)

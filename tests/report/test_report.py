@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import copy
 import math
+import re
 
 import pytest
 
@@ -130,6 +131,24 @@ def test_the_figure_that_shows_the_verdict_best_stands_first_and_the_others_with
     texts = ("<h1>", ">step<", "What was not checked", "Control design: ", ">bode<", "Proof on")
     order = [page.index(text) for text in texts]
     assert order == sorted(order) and page.count(">step<") == 1 and ">other<" in page
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_every_text_colour_stands_out_from_the_page(scheme: str) -> None:
+    """At least 4.5, the contrast that WCAG 2.1 asks of text (1.4.3); the least is 5.3."""
+
+    def luminance(colour: str) -> float:
+        digits = colour * 2 if len(colour) == 3 else colour
+        parts = [int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4)]
+        red, green, blue = (x / 12.92 if x <= 0.04045 else ((x + 0.055) / 1.055) ** 2.4 for x in parts)
+        return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+    page = render(_record())
+    colours = dict(re.findall(r"--(\w+): #(\w+);", page.split(":root")[1 if scheme == "light" else 2].split("}")[0]))
+    for text in ("ink", "muted", "good", "bad", "partial"):
+        for ground in ("page", "card"):
+            low, high = sorted(luminance(colours[name]) for name in (text, ground))
+            assert (high + 0.05) / (low + 0.05) >= 4.5, (text, ground)
 
 
 def test_tables_keep_their_heads_in_print_and_their_labels_on_a_phone() -> None:
