@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 @bus_options
 @output_options
 def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str | None) -> None:
-    """Show every quantity, the methods to it, the interval to expect, and what this drive lacks for it.
+    """Show for every quantity the methods, the interval to expect, and what this drive lacks.
 
     The drive is only read. Without --map the map for its vendor and product is used; without such a map the objects of
     CiA 402. The intervals were measured on simulated drives of the same capability level; where none was measured, none

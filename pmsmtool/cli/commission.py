@@ -107,7 +107,7 @@ def commission_command(
     are the start.
     Consents are asked one by one: the motion envelope before anything moves, the list of differences before anything
     is written, and the envelope of the proof, which runs the flashed drive up to its designed limits. The chain ends
-    at the first criterion that is not met, with the drive off and as it was; --resume goes on there. A simulated drive
+    at the first criterion that is not met, with the drive off and restored; --resume goes on there. A simulated drive
     starts from factory memory unless its channel names a memory file (nv=).
 
     On a drive that gives less than the reference drive (`pmsmtool caps`) every stage runs as far as its capability

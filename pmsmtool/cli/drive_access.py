@@ -70,14 +70,14 @@ def read_map(path: Path | None) -> DriveMap:
     return parse_drive_map(read_text(path, hint=hint), str(path))
 
 
-def map_of_drive(bus: BusOptions, map_file: Path | None) -> DriveMap:
-    """Return the map that is given, else the one for the drive that answers: its family's, or that of CiA 402."""
-    from pmsmtool.measurement.capabilities import choose_map
+def map_of_drive(bus: BusOptions, map_file: Path | None, other: str | None = None) -> DriveMap:
+    """Return the map that is given, else that of the family of the drive that answers, else ``other`` or CiA 402."""
+    from pmsmtool.drive_maps.shipped_maps import GENERIC, family_of, load_family
 
     if map_file is not None:
         return read_map(map_file)
     with open_node(bus, within_s=LOOKING_S) as node:
-        return choose_map(node.identity(), None)
+        return family_of(*node.identity().vendor_product) or load_family(other or GENERIC)
 
 
 def rehearsal_bus(

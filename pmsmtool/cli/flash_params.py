@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.drive_access import WHOLE_SET_S, map_of_drive, map_option, open_node, read_map
+from pmsmtool.cli.drive_access import OWN_FAMILY, WHOLE_SET_S, map_of_drive, map_option, open_node, read_map
 from pmsmtool.cli.fleet import NodeList, flash_fleet
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output
@@ -64,8 +64,7 @@ def flash_params_command(
     if nodes is None and (serials or canary):
         raise click.UsageError("--serials and --canary go with --nodes")
     if map_file is None:
-        family = map_of_drive(bus if nodes is None else replace(bus, node=nodes[0]), None)
-        drive_map = family if family.vendor else drive_map
+        drive_map = map_of_drive(bus if nodes is None else replace(bus, node=nodes[0]), None, OWN_FAMILY)
     if nodes is not None:
         flash_fleet(
             nodes, wanted, drive_map, bus, motion, out, store=not no_store, dry_run=dry_run, check=check,

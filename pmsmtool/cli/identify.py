@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     "--method",
     type=click.Choice(["auto", "inject", "recorder", "standard", "vendor", "manual"]),
     default="auto",
-    help="How; auto: the best this drive can (`pmsmtool caps`).",
+    help="How; auto: the best that this drive allows (`pmsmtool caps`).",
 )
 @click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="Recompute from the traces of a run; moves nothing.")
 @click.option("--fingerprint", type=FOLDER, metavar="RUN", help="Measure R, L, psi, encoder and pole pairs again, in "

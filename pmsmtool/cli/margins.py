@@ -51,15 +51,17 @@ IN_PROCESS = 20_000
     "--scheduler", default="processes", metavar="NAME", help="local, processes, or a Dask scheduler's address."
 )
 @click.option("--workers", type=click.IntRange(1), metavar="N", help="Processes.  [default: one per core]")
-@click.option("--phase-margin-deg", type=float, default=30.0, metavar="DEG", help="Least, of the current loops.")
-@click.option("--gain-margin-db", type=float, default=4.0, metavar="DB", help="Least, of the current loops.")
-@click.option("--speed-phase-margin-deg", type=float, default=30.0, metavar="DEG", help="Least, of the speed loop.")
+@click.option("--phase-margin-deg", type=float, default=30.0, metavar="DEG", help="Least one of the current loops.")
+@click.option("--gain-margin-db", type=float, default=4.0, metavar="DB", help="Least one of the current loops.")
+@click.option("--speed-phase-margin-deg", type=float, default=30.0, metavar="DEG", help="Least one of the speed loop.")
 @click.option("--voltage-headroom", type=float, metavar="RATIO", help="Least 1 - |v|/V_max.  [default: not judged]")
 @click.option("--current-headroom", type=float, metavar="RATIO", help="Least 1 - |i|/I_max.  [default: not judged]")
 @click.option("--thermal-headroom", type=float, metavar="RATIO", help="Least 1 - copper loss.  [default: not judged]")
 @click.option("--u-dc", "U_dc_v", type=(_VOLTAGE, _VOLTAGE), metavar="LOW HIGH", help="Range of the DC link.  [+-5 %]")
-@click.option("--winding", "T_winding_c", type=(_TEMPERATURE, _TEMPERATURE), metavar="LOW HIGH", help="Winding.")
-@click.option("--magnet", "T_magnet_c", type=(_TEMPERATURE, _TEMPERATURE), metavar="LOW HIGH", help="Magnet.")
+@click.option("--winding", "T_winding_c", type=(_TEMPERATURE, _TEMPERATURE), metavar="LOW HIGH",
+              help="Range of the winding temperature.")  # fmt: skip
+@click.option("--magnet", "T_magnet_c", type=(_TEMPERATURE, _TEMPERATURE), metavar="LOW HIGH",
+              help="Range of the magnet temperature.")  # fmt: skip
 @click.option("--plot", "plot_path", type=FILE, help="Margins over the box to write (.svg, .png, .pdf).")
 @output_options
 def margins_command(

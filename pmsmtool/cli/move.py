@@ -124,7 +124,7 @@ def move_command(
             f"time{'s' if times > 1 else ''}",
             f"voltage off where the shaft is {math.degrees(drive.error_limit_rad):.3g} deg behind and comes no nearer",
             *([] if find is None else ["its profile is found first by slower moves within this way"]),
-            *(f"lent: {name} {value:.5g} {_unit(name)}" for name, value in lent.items()),
+            *(f"changed for the move: {name} {value:.5g} {_unit(name)}" for name, value in lent.items()),
             "nothing is stored in the drive; every changed object is restored",
         ]  # fmt: skip
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
@@ -136,7 +136,7 @@ def move_command(
             seconds = connection.clock.now() - began
         drive.close()
     if counts is not None:
-        out.note(f"lent: {counts}")
+        out.note(f"changed for the move: {counts}")
     run.save(TRACE, trace_npz(trace))
     found = move_result(trace)
     values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]
@@ -241,5 +241,5 @@ def _held(drive: PositionDrive, name: str) -> float | None:
 def _lines(found: MoveResult) -> list[str]:
     from pmsmtool.axis.move import UNITS, shown
 
-    rows = [(name, shown(float(getattr(found, name)), unit)) for name, unit in UNITS.items()]
+    rows = [(name.rpartition("_")[0] or name, shown(float(getattr(found, name)), unit)) for name, unit in UNITS.items()]
     return table(("move", "value"), rows)

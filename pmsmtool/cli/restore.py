@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map, refuse_another_family
+from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map
 from pmsmtool.cli.options import (
     BusOptions,
     FilePath,
@@ -54,6 +54,7 @@ def restore_command(
     """
     from pmsmtool.cli.flash_session import checked_identity, plan_facts, told, write_plan
     from pmsmtool.drive.objects import STORE_ALL
+    from pmsmtool.drive_maps.shipped_maps import family_of
     from pmsmtool.errors import ConfigError, Partial
     from pmsmtool.flash.download import describe, set_named
     from pmsmtool.flash.journal import JournalFolder, read_snapshot
@@ -82,9 +83,7 @@ def restore_command(
             node.map = whole_map(identity)
             snapshot = readdressed(snapshot, node.node) if given is not None else snapshot
         else:
-            node.map = drive_map
-            if map_file is None:
-                refuse_another_family(node)
+            node.map = drive_map if map_file is not None else family_of(*identity.vendor_product) or drive_map
             checked_identity(node, out)
         check_snapshot(node.map, snapshot, identity, other_drive=other_drive)
         state = f", state {snapshot.state}" if snapshot.kind != "backup" else ""

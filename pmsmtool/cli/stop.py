@@ -27,7 +27,7 @@ def stop_command(bus: BusOptions, out: Output, everyone: bool) -> None:
 
     Exit code 8 when a drive does not confirm, or none answers: the machine may be energised, use the hardware stop.
     A drive that brakes has the time of its ramp; one without a valid answer for 2 s has not confirmed. Several drives
-    are stopped at the same time. Nothing is waited for that another program does with the drive.
+    are stopped at the same time. It waits for no other program.
     """
     from pmsmtool.drive.drive_node import DriveNode, state_text
 

@@ -66,7 +66,8 @@ if TYPE_CHECKING:
 )
 @click.option("--speed-bandwidth-hz", type=HZ, metavar="HZ", help="Crossover of the speed loop.  [default: from "
               "--speed-phase-margin-deg]")  # fmt: skip
-@click.option("--speed-phase-margin-deg", type=DEG, default=60.0, metavar="DEG", help="Of the symmetric optimum.")
+@click.option("--speed-phase-margin-deg", type=DEG, default=60.0, metavar="DEG",
+              help="Phase margin of the symmetric optimum.")  # fmt: skip
 @click.option("--speed-damping", type=float, default=1.0, help="Damping of pole-placement.")
 @click.option("--speed-decimation", type=int, metavar="N", help="Control periods per speed-controller period.")
 @click.option("--speed-filter-hz", type=HZ, metavar="HZ", help="Cut-off of the speed filter.")
@@ -82,7 +83,7 @@ if TYPE_CHECKING:
     default="best",
     help="Reference governor.",
 )
-@click.option("--eps", type=float, metavar="RATIO", help="Tightening of its steady state.  [default: 0.015 or more]")
+@click.option("--eps", type=float, metavar="RATIO", help="Voltage share that it keeps back.  [default: from 0.015 on]")
 @click.option(
     "--field-weakening",
     type=click.Choice(["auto", "off", "lookup", "gradient", "accelerated", "uncompensated"]),
@@ -93,7 +94,7 @@ if TYPE_CHECKING:
               "set then holds nothing else.")  # fmt: skip
 @click.option("--axis-phase-margin-deg", type=DEG, default=45.0, metavar="DEG", help="Least phase margin of both "
               "loops over the tolerance box.")  # fmt: skip
-@click.option("--axis-peak-db", type=DB, default=6.0, metavar="DB", help="Largest |S| of both loops over it.")
+@click.option("--axis-peak-db", type=DB, default=6.0, metavar="DB", help="Largest |S| of both, over the box.")
 @click.option("--loop-rate-hz", type=HZ, metavar="HZ", help="Rate of the drive's speed and position loops.  "
               "[default: as its map states]")  # fmt: skip
 @click.option("--stored", type=FILE, metavar="FILE", help="What the drive holds (`pmsmtool backup`): its gains are "
@@ -104,8 +105,8 @@ if TYPE_CHECKING:
               "firmware (--map).")  # fmt: skip
 @click.option("--limit-speed-rpm", type=float, metavar="RPM", help="Speed up to which a drive of --map never saturates."
               "  [default: at the most torque x speed]")  # fmt: skip
-@click.option("--limit-rise-s", type=float, default=0.02, metavar="S", help="Its time from zero to its torque limit.")
-@click.option("--limit-acceleration-rpm-per-s", type=float, metavar="RPM/S", help="Its largest acceleration.  "
+@click.option("--limit-rise-s", type=float, default=0.02, metavar="S", help="That drive's time to its torque limit.")
+@click.option("--limit-acceleration-rpm-per-s", type=float, metavar="RPM/S", help="That drive's largest acceleration.  "
               "[default: torque limit / J]")  # fmt: skip
 @output_options
 def tune_command(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map
+from pmsmtool.cli.drive_access import OWN_FAMILY, WHOLE_SET_S, map_of_drive, map_option, open_node
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
@@ -36,7 +36,7 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
     from pmsmtool.flash.journal import read_snapshot
     from pmsmtool.flash.restore import check_snapshot, plan_download, plan_restore
 
-    drive_map = read_map(map_file)
+    drive_map = map_of_drive(bus, map_file, OWN_FAMILY)
     backup = source.suffix == ".json"
     with open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
         identity = checked_identity(node, out)
