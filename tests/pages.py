@@ -6,12 +6,13 @@ from __future__ import annotations
 import re
 
 _FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+_BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"!?\[([^\]]*)\]\(([^)\s]+)\)")
 
 
 def fenced(text: str, language: str) -> list[str]:
-    """Return the fenced blocks of a language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    """Return the fenced blocks of a language; with an empty one those that name none."""
+    return [block for name, block in _BLOCK.findall(text) if name == language]
 
 
 def rows_of(text: str, before: str) -> list[list[str]]:

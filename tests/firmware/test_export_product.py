@@ -5,9 +5,11 @@ from __future__ import annotations
 
 import re
 import shutil
+import struct
 import subprocess
 import sys
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -17,7 +19,9 @@ from pmsmtool.firmware.export_readme import COSTS, counted_law, period_share, st
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.firmware.laws import LAWS, laws_in_use
 from pmsmtool.params.catalogue import CATALOGUE
+from tests.pages import fenced
 
+PAGE = Path(__file__).resolve().parents[2] / "docs/firmware.md"
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_linux_compiler = pytest.mark.skipif(
     COMPILER is None or not sys.platform.startswith("linux"), reason="no C compiler that links ELF on this machine"
@@ -81,6 +85,21 @@ def test_it_links_without_a_c_library(law: str, optimised: str, tmp_path: Path) 
     link = ["-shared", "-Wl,-z,defs", "-Wl,-Bsymbolic", "-o", "core.so"]
     done = subprocess.run([*command, *link, *sources], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.chain
+@pytest.mark.skipif(find_spec("ziglang") is None, reason="no ziglang: pip install -e '.[cross]'")
+def test_the_documented_command_links_the_example_for_a_cortex_m4(tmp_path: Path) -> None:
+    """As docs/firmware.md says, word by word: no symbol is missing without a C library."""
+    for name, text in exported(ALONE["none"]).items():
+        (tmp_path / name).write_text(text)
+    (block,) = (text for text in fenced(PAGE.read_text(encoding="utf-8"), "") if "thumb" in text)
+    command = block.partition("python -m ")[2].replace("\\\n", " ").split()
+    at = command.index("*.c")
+    command[at : at + 1] = sorted(path.name for path in tmp_path.glob("*.c"))
+    done = subprocess.run([sys.executable, "-m", *command], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert struct.unpack_from("<HH", (tmp_path / command[-1]).read_bytes(), 16) == (2, 40), "a program, for ARM"
 
 
 @pytest.mark.chain
