@@ -60,11 +60,12 @@ def flash_params_command(
     from pmsmtool.flash.download import set_named
 
     drive_map = read_map(map_file)
-    wanted = load_parameters(source, drive_map)
+    wanted = load_parameters(source, drive_map)  # a file that cannot be read needs no bus
     if nodes is None and (serials or canary):
         raise click.UsageError("--serials and --canary go with --nodes")
     if map_file is None:
         drive_map = map_of_drive(bus if nodes is None else replace(bus, node=nodes[0]), None, OWN_FAMILY)
+        wanted = load_parameters(source, drive_map)
     if nodes is not None:
         flash_fleet(
             nodes, wanted, drive_map, bus, motion, out, store=not no_store, dry_run=dry_run, check=check,

@@ -106,7 +106,7 @@ def check_drives(identities: Sequence[Identity], serials: Mapping[int, int], can
         elif listed != found.serial or not found.serial:
             reasons.append(f"node {found.node}: serial number {found.serial}, the list has {listed}")
         reasons += [
-            f"node {found.node}: {key} {getattr(found, key)}, the canary's is {canary.get(key)}"
+            f"node {found.node}: {key} {_shown(getattr(found, key))}, the canary's is {_shown(canary.get(key))}"
             for key in KIND
             if getattr(found, key) != canary.get(key)
         ]
@@ -116,6 +116,11 @@ def check_drives(identities: Sequence[Identity], serials: Mapping[int, int], can
             likely="drives were exchanged, or another type or firmware is among them",
             hint="`pmsmtool scan` shows who answers; correct the list, or write the other drives with a person present",
         )
+
+
+def _shown(value: object) -> str:
+    """Return a number of the identity as `pmsmtool scan` shows it."""
+    return f"{value:#x}" if isinstance(value, int) else str(value)
 
 
 def wait_still(nodes: Sequence[DriveNode]) -> None:

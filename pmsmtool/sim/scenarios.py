@@ -115,7 +115,8 @@ def _violations(scenario: Scenario) -> list[str]:
         found.append("start_rpm is not finite")
     for name, profile in scenario.schedule.items():
         if name not in SCHEDULES:
-            found.append(f"[schedule] {name}: unknown{did_you_mean(name, list(SCHEDULES))}")
+            near = did_you_mean(name, list(SCHEDULES)) or f", known are {', '.join(SCHEDULES)}"
+            found.append(f"[schedule] {name}: unknown{near}")
         elif isinstance(profile, (int, float)):
             found.append(f"[schedule] {name} is a number; write [(0.0, {profile!r})]: times in s and values")
         elif not profile:

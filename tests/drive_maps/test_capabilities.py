@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -235,6 +236,16 @@ def test_identify_by_cia402_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     # without a machine file the dead time is unknown: it takes 4 % here, within the interval of 6 %
     assert values["psi_f_wb"] == pytest.approx(truth.psi_f_wb, rel=0.06)
     assert values["J_per_psi"] == pytest.approx(truth.J_kgm2 / truth.psi_f_wb, rel=0.02)
+
+
+def test_flash_params_takes_the_map_of_the_drives_family(tmp_path: Path) -> None:
+    """The set, too: one pair of gains serves both axes there, 144 V/A; through the reference map it would be 204."""
+    design = str(tmp_path / "design.toml")
+    assert run("tune", "interior-2k2", "-o", design).exit_code == 0
+    drive = ("--sim", CHANNEL + "&drive=epos4")
+    chosen, given = (run(*drive, "flash-params", design, "--dry-run", *more) for more in ((), ("--map", "epos4")))
+    assert chosen.exit_code == 0 and chosen.stdout == given.stdout
+    assert re.search(r"current.K_p_q_v_per_a .*-> +144 V/A", chosen.stdout)
 
 
 def test_a_known_drive_is_told_its_map() -> None:

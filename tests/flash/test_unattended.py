@@ -52,9 +52,9 @@ def test_drives_are_listed_and_of_the_canary_s_kind() -> None:
         ({2: 102}, CANARY, "node 3: not in the list"),
         ({2: 102, 3: 999}, CANARY, "node 3: serial number 103, the list has 999"),
         ({2: 102, 3: 103}, {**CANARY, "software": "1.1"}, "node 2: software 1.0, the canary's is 1.1"),
-        ({2: 102, 3: 103}, {**CANARY, "vendor": 9}, "node 3: vendor 1, the canary's is 9"),
-        ({2: 102, 3: 103}, {**CANARY, "product": 9}, "node 2: product 2, the canary's is 9"),
-        ({2: 102, 3: 103}, {**CANARY, "revision": 9}, "node 2: revision 3, the canary's is 9"),
+        ({2: 102, 3: 103}, {**CANARY, "vendor": 9}, "node 3: vendor 0x1, the canary's is 0x9"),
+        ({2: 102, 3: 103}, {**CANARY, "product": 9}, "node 2: product 0x2, the canary's is 0x9"),
+        ({2: 102, 3: 103}, {**CANARY, "revision": 9}, "node 2: revision 0x3, the canary's is 0x9"),
         ({2: 102, 3: 103}, {**CANARY, "hardware": "B"}, "node 2: hardware A, the canary's is B"),
     ):
         with pytest.raises(SafetyRefusal, match=reason):
