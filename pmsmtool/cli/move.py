@@ -162,6 +162,7 @@ def _identified(
     source: MachineFile, trace: Trace, drive: PositionDrive, run: RunDirectory, path: Path | None, out: Output
 ) -> dict[str, Estimate]:
     """Find inertia and friction, write the machine file, and return both."""
+    from pmsmtool.commissioning.compared_stage import refuse_inertia
     from pmsmtool.files import write_file
     from pmsmtool.identification.completed_machine import completed_machine
     from pmsmtool.identification.move_mechanics import move_mechanics
@@ -170,6 +171,7 @@ def _identified(
     ratios = move_mechanics(
         trace, pole_pairs=source.machine.pole_pairs, undecided=drive.current_undecided, rated_apk=drive.rated_apk
     )
+    refuse_inertia(source, ratios["J_per_psi"], run)
     made = completed_machine(source, ratios, "as given").machine
     assert made is not None
     text = dump_machine_file(made)

@@ -7,12 +7,14 @@ import contextlib
 from collections.abc import Collection
 from dataclasses import replace
 
-from pmsmtool.commissioning.contradiction import ACCEPTABLE, DATA_SHEET, HELD, ORDER, compare
+from pmsmtool.commissioning.contradiction import ACCEPTABLE, DATA_SHEET, HELD, ORDER, RATIO, compare
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.motion_objects import ENCODER_COUNTS, MOTOR_TURNS
 from pmsmtool.drive.standard_drive import RecorderDrive
 from pmsmtool.errors import ConfigError, Contradiction, SafetyRefusal, SdoAbort
+from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.params.parameter_set import default_set
 from pmsmtool.report.comparison import contradictions
 from pmsmtool.run_directory import RunDirectory, Stage
@@ -111,6 +113,26 @@ def compared(
         return stage
     lines = [str(row["text"]) for row in wrong]
     return replace(stage, status="fail", note="\n".join([*lines, *([stage.note] if stage.note else [])]))
+
+
+def refuse_inertia(known: MachineFile, ratio: Estimate, run: RunDirectory) -> None:
+    """Refuse J over psi of moves that is less than MACHINE allows; a load may add any amount.
+
+    Raises
+    ------
+    Contradiction
+        The drive counts its current in another unit, or the machine file is that of another motor.
+    """
+    value = {"name": RATIO, "value": ratio.value, "std": ratio.std, "total_95": total_half_width(ratio)}
+    (row,) = (row for row in compare(known, {}, [value], loaded=True) if row.name == RATIO)
+    if row.verdict == "contradicts":
+        raise Contradiction(
+            f"the moves show J/psi of {row.measured:.4g} +-{row.interval:.2g} kg m2/Wb, and the rotor of MACHINE alone "
+            f"has {row.stated:.4g} (at least {row.low:.4g}); nothing was written",
+            where=str(run.path),
+            likely="the drive counts its current in another unit than its map states, or this is another motor",
+            hint="correct the unit of the current in the map, or J_kgm2 and psi_f_wb in the machine file",
+        )
 
 
 def refusal(stage: Stage, run: RunDirectory) -> Contradiction | None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 from pmsmtool.arrays import Array
 from pmsmtool.axis.demand import trapezoid_of
 from pmsmtool.axis.design import PID
-from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
@@ -219,3 +220,21 @@ def test_a_move_of_no_way_is_refused(tool: Tool, drive: Sequence[str]) -> None:
 def test_without_map_the_drives_identity_chooses_it(tool: Tool, drive: Sequence[str]) -> None:
     code, _, said = tool("move", "--by", "60deg", *drive)
     assert code == 7 and "0x608F" not in said  # the map has its increments per turn
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("family", ["epos2", "faulhaber"])
+def test_a_standard_object_that_counts_milliamperes_is_read_as_the_map_says(tool: Tool, family: str) -> None:
+    """Their 0x6078 is no share of the rated current; a file of four times the rotor is not the motor that moved."""
+    asked = ("move", "--by", "90deg", "--times", "2", "--settle", "0.2s", "--yes", "--json")
+    drive = ("--sim", f"interior-2k2?drive={family}&nv=:memory:")
+    code, printed, said = tool(*asked, *drive, "--identify", "interior-2k2")
+    assert code == 0, said
+    inertia = json.loads(printed)["identified"]["J_kgm2"]  # 0.018 +-0.004: peak and rms are both in it
+    assert abs(inertia["value"] - J) < inertia["systematic"] + 2.0 * inertia["std"] < 0.4 * J
+    other = load_machine_file("interior-2k2")
+    other = replace(other, machine=replace(other.machine, J_kgm2=4.0 * J), simulation={})
+    Path("other.toml").write_text(dump_machine_file(other), encoding="utf-8")
+    code, _, said = tool(*asked, *drive, "--identify", "other.toml", "-o", "found.toml")
+    assert code == 1 and "in another unit than its map states" in said, said
+    assert not Path("found.toml").exists()

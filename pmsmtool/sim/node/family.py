@@ -16,6 +16,7 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.cia402 import Mode
 from pmsmtool.data_types import SHORT
 from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, SignalCell
+from pmsmtool.drive_maps.motion_objects import UNDECIDED
 from pmsmtool.drive_maps.wire_units import WireUnit, wire_unit
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, TORQUE_PER_AMPERE
@@ -117,6 +118,12 @@ class Face:
             dictionary.hide(index)
         for name, signal in self.drive_map.signals.items():
             dictionary.show(_signal_entry(name, signal, dictionary))
+        current = self.drive_map.motion.get("current")
+        if current is not None and current.index in STANDARD:
+            # a standard object that counts otherwise; amperes are peak here, as everywhere behind
+            unit = current.unit.replace(UNDECIDED, " peak")
+            signal = SignalCell(current.index, current.sub, current.wire, unit, current.source)
+            dictionary.show(_signal_entry("i_q_a", signal, dictionary))
         revisions = self.drive_map.identity.revisions
         if revisions:
             dictionary["identity.revision"].put(revisions[-1] << 16)
