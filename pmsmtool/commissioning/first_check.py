@@ -145,7 +145,7 @@ def fault_row(what: str, likely: str) -> Finding:
 def _ordered(found: list[Finding]) -> list[Finding]:
     """Return the rows in their order, with one for each thing that was not looked at."""
     missing = set(ALL) - {finding.looked_at for finding in found}
-    rows = [*found, *(Finding(name, NOT_SEEN, "what is wrong comes first") for name in missing)]
+    rows = [*found, *(Finding(name, NOT_SEEN, "mend what is wrong first") for name in missing)]
     return sorted(rows, key=lambda row: ORDER.index(row.looked_at))
 
 

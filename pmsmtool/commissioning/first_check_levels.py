@@ -57,9 +57,9 @@ UNSEEN = {
     "supply": "the drive does not show its DC link (0x6079)",
     "phases": "the drive shows no current of a single phase",
     "current sensors": "the drive shows no current of a single phase",
-    "shaft": "what is wrong comes first",
+    "shaft": "mend what is wrong first",
     "pole pairs": "the drive cannot turn a current vector: it has no commutation angle (0x60EA)",
-    "encoder sign": "what is wrong comes first",
+    "encoder sign": "mend what is wrong first",
 }
 RUNS_OFF_BY = "an open or shorted phase, or gains of the current loop that do not fit the motor"
 LATE_S = 0.005
@@ -210,7 +210,7 @@ def judge_kept(pushes: Trace) -> list[Finding]:
     shown = f"forth and back the drive shows {seen} of the current asked for"
     return [
         Finding("phases", WRONG, shown, "an open phase, or the supply in current limit"),
-        Finding("shaft", NOT_SEEN, "what is wrong comes first"),
+        Finding("shaft", NOT_SEEN, "mend what is wrong first"),
     ]
 
 

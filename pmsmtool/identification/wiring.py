@@ -111,13 +111,13 @@ def judge_turn(turn: Trace, pole_pairs: int, counts_against: bool) -> list[Findi
     missed = abs(ratio * (after - before))
     if missed > LAG_RAD:
         back = min(math.degrees(missed), 360.0)
-        seen = f"led there and back, the rotor stands {back:.3g} deg (electrical) or more from where it was"
+        seen = f"after a turn there and back it stands {back:.3g} deg (electrical) or more from where it was"
         return [Finding("shaft", WRONG, seen, SLIPS_BY), *unseen]
     against = ratio < 0.0
     shown, set_for = ("against" if each else "with" for each in (against, counts_against))
-    seen = f"counts {shown} the phase order, the drive is set for {set_for}"
+    seen = f"counts {shown} the phase order; the drive is set for counting {set_for} it"
     return [
-        Finding("shaft", OK, f"led there and back within {math.degrees(missed):.2g} deg (electrical)"),
+        Finding("shaft", OK, f"follows the vector there and back within {math.degrees(missed):.2g} deg (electrical)"),
         _pole_pairs(abs(ratio), pole_pairs, LAG_RAD / way_rad),
         Finding("encoder sign", OK, seen)
         if against == counts_against
@@ -128,7 +128,7 @@ def judge_turn(turn: Trace, pole_pairs: int, counts_against: bool) -> list[Findi
 def _pole_pairs(ratio: float, stated: int, same: float) -> Finding:
     """Return the row of a ratio of electrical to encoder angle, which is known to a share ``same``."""
     if abs(ratio / stated - 1.0) <= same or round(ratio) == stated:
-        return Finding("pole pairs", OK, f"{ratio:.3g} for the stated {stated}: so are the counts per turn")
+        return Finding("pole pairs", OK, f"{ratio:.3g} measured, {stated} stated; the counts per turn fit, too")
     factor, other = stated / ratio, round(ratio)
     seen = f"{ratio:.3g} electrical turns per turn of the encoder, {stated} pole pairs are stated"
     counts = f"counts per turn: the encoder shows {factor:.3g} times the angle"
@@ -216,7 +216,7 @@ def judge_push(pushes: Trace) -> list[Finding]:
         seen = f"the drive shows {100.0 * share:.2g} % of the current asked for"
         found.append(Finding("phases", WRONG, seen, OPEN_BY))
     if not np.any(way):
-        return [*found, Finding("shaft", NOT_SEEN, "what is wrong comes first")]
+        return [*found, Finding("shaft", NOT_SEEN, "mend what is wrong first")]
     if way[0] * way[1] >= 0.0:
         how = "both the same way" if np.all(way) else "one way alone"
         return [*found, Finding("shaft", WRONG, f"torque forth and back moves the shaft by {ways}, {how}", NOT_BACK_BY)]
