@@ -141,7 +141,7 @@ def test_a_tool_that_dies_at_any_moment_leaves_a_shaft_within_the_speed(
     answer = push_both_ways(cast(Drive, shaft), plan, lambda name, trace: None)
     assert abs(shaft.speed) < AT_REST * plan.omega_m_rad_s and answer.direction == direction
     assert answer.per_ampere == pytest.approx(rate, rel=0.02) and answer.friction_a == pytest.approx(friction, abs=0.1)
-    coast_both_ways(cast(Drive, shaft), plan, answer, ("theta_m_rad",), lambda name, trace: None)
+    coast_both_ways(cast(Drive, shaft), plan, answer, ("theta_m_rad", "u_d_v", "u_q_v"), lambda name, trace: None)
     run_to_voltage(cast(Drive, shaft), plan, answer)
     assert shaft.at_failure <= NEAR * MOST
     assert shaft.fastest > 10.0, "it is pushed all the same"

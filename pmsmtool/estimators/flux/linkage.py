@@ -223,7 +223,6 @@ def estimate_flux_linkage(
         systematic=math.hypot(tolerance.flux * psi, per_instant * tolerance.encoder_latency_s) + abs(if_old),
         unit="Wb",
         n=len(rows.w),
-        chi2=math.nan,
         T_c=T,
         method="coasting in both directions, d currents of both signs, sampled-data correction",
         i_d_apk=0.0,
@@ -424,17 +423,10 @@ def normalised(measured: Estimate, T_ref_c: float, alpha: float, tolerance: Sens
     if known:
         away = tolerance.magnet_per_k * (measured.T_c - T_ref_c)
         thermal = math.hypot(alpha * tolerance.temperature_k, away) * value
-    return Estimate(
+    return replace(
+        measured,
         value=value,
         std=measured.std / factor,
         systematic=math.hypot(measured.systematic / factor, thermal),
-        unit="Wb",
-        n=measured.n,
-        chi2=measured.chi2,
-        T_c=measured.T_c,
-        method=measured.method,
-        i_d_apk=measured.i_d_apk,
-        i_q_apk=measured.i_q_apk,
-        dof=measured.dof,
         fallback="" if known else "magnet temperature unknown: psi_f is not normalised",
     )

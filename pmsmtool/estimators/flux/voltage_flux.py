@@ -24,6 +24,8 @@ from pmsmtool.trace import Trace
 BLOCKS = 12
 UNDRIVEN_FLOOR = 0.01
 """Relative 95 % model error of the undriven voltage: polled speed and voltage are not of the same instant."""
+INVERTER_SHARE = 0.5
+"""What the inverter's error may differ by between fast and slow, of itself: 3.0 and 5.0 V, for psi 6 % too small."""
 DEAD_TIME = 1.07
 """What the dead time takes of the largest voltage, over t_d f_s U_dc, at the small current of the top: fitted to 75
 random drives (benchmarks.level_intervals standard --first 5000; constant 0.0 %, rest 0.7 % rms, at most 2.7 %)."""
@@ -36,9 +38,8 @@ HELD_SHARE = 0.85
 STEADY = 0.02
 """Largest relative change of the speed over the record of the top."""
 RISING = 0.02
-"""Largest change of the current over it, of the one asked for: where it comes back, the voltage has not ended. A loop
-that left its limit slowly made the psi of a salient motor 14 to 18 % too large, at +-3.6 %, where it rose by 0.037 and
-more; 0.005 at the most where the voltage ends."""
+"""Largest change of the current over it, of the one asked for: a loop that left its limit slowly made the psi of a
+salient motor 14 to 18 % too large, where it rose by 0.037 and more; 0.005 at the most where the voltage ends."""
 
 
 def flux_by_undriven_voltage(
@@ -52,23 +53,35 @@ def flux_by_undriven_voltage(
         ``E_EXCITATION``: too few rows, or no speed in one of the directions.
     """
     rows = [row for coast in coasts for row in _means(coast, pole_pairs)]
-    w, u_d, u_q = (np.array([row[k] for row in rows]) for k in range(3))
-    if len(rows) < BLOCKS or not (np.any(w > 0.0) and np.any(w < 0.0)):
+    if len(rows) < BLOCKS or not min(rows)[0] < 0.0 < max(rows)[0]:
         raise refuse("E_EXCITATION", "the machine did not coast both ways", stage="undriven voltage")
+    psi, std, error = _flux(rows)
+    early, late = (_flux([row for k, row in enumerate(rows) if k // (BLOCKS // 2) % 2 == half])[0] for half in (0, 1))
+    open_ = INVERTER_SHARE * error / np.ptp([abs(row[0]) for row in rows])
+    doubt = math.hypot((tolerance or SensorTolerance()).flux, UNDRIVEN_FLOOR, (late - early) / psi, open_ / psi)
+    return Estimate(psi, std, doubt * psi, "Wb", n=len(rows), method="undriven voltage over speed", dof=len(rows) - 2.0)
+
+
+def voltage_drift(coast: Trace) -> float:
+    """Return how much the voltage over the speed changes from the first half of a coast to the second (relative)."""
+    early, late = np.split(np.array([math.hypot(*u) / abs(w) if w else math.inf for w, *u in _means(coast, 1)]), 2)
+    before = float(np.sum(early))
+    return float(np.sum(late)) / before - 1.0 if before > 0.0 else 0.0
+
+
+def _flux(rows: Sequence[tuple[float, float, float]]) -> tuple[float, float, float]:
+    """Return the flux linkage (Wb) of electrical speeds and voltages, its deviation, and the inverter's error (V)."""
+    w, u_d, u_q = np.array(rows).T
     matrix = np.column_stack([w, np.sign(w)])
     inverse = np.linalg.inv(matrix.T @ matrix)
-    parts, variance = [], 0.0
+    parts, errors, variance = [], [], 0.0
     for u in (u_q, u_d):
         solution = inverse @ matrix.T @ u
         residual = u - matrix @ solution
         parts.append(float(solution[0]))
+        errors.append(float(solution[1]))
         variance += float(residual @ residual) / (len(rows) - 2) * float(inverse[0, 0])
-    psi = math.hypot(*parts)
-    doubt = math.hypot((tolerance or SensorTolerance()).flux, UNDRIVEN_FLOOR)
-    return Estimate(
-        psi, math.sqrt(variance), doubt * psi, "Wb", n=len(rows), method="undriven voltage over speed",
-        dof=len(rows) - 2.0,
-    )  # fmt: skip
+    return math.hypot(*parts), math.sqrt(variance), math.hypot(*errors)
 
 
 def _means(coast: Trace, pole_pairs: int) -> list[tuple[float, float, float]]:

@@ -288,9 +288,6 @@ def _stopped(run: Trace) -> bool:
     return len(turned) > 0 and float(np.min(turned) * np.max(turned)) <= 0.0
 
 
-# ---- models -----------------------------------------------------------------------------------------------------
-
-
 def _rigid(lines: _Lines, x: Array) -> tuple[Complex, Complex]:
     """Response and basis of the transient for ln 1/J and delay."""
     return np.exp(x[0] - 1j * lines.omega * x[1] * lines.T), np.stack([np.ones_like(lines.back), lines.back], axis=1)
@@ -356,18 +353,12 @@ def _estimates(fit: Fit, chi2: float) -> dict[str, Estimate]:
         ("antiresonance_hz", 2, 2.0 * math.pi, 0.0, "Hz"),
         ("resonance_zeta", 1, 1.0, ZETA_FLOOR, "1"),
     )
-    return {
-        name: Estimate(
-            float(values[k]) / per,
-            float(values[k]) * math.hypot(float(bound[2 + k]) * widen, floor) / per,
-            0.0,
-            unit,
-            n=len(fit.residual),
-            chi2=chi2,
-            method=METHOD,
-        )
-        for name, k, per, floor, unit in rows
-    }
+    found = {}
+    for name, k, per, floor, unit in rows:
+        value = float(values[k]) / per
+        std = value * math.hypot(float(bound[2 + k]) * widen, floor)
+        found[name] = Estimate(value, std, 0.0, unit, n=len(fit.residual), chi2=chi2, method=METHOD)
+    return found
 
 
 def _inertia(
@@ -381,15 +372,9 @@ def _inertia(
     value = math.exp(float(weights @ fit.x))
     own = math.sqrt(max(1.0, chi2) * float(weights @ covariance @ weights))
     return Estimate(
-        value,
-        value * math.hypot(own, scale_std, INERTIA_FLOOR),
-        tolerance.inertia * value,
-        "kg m2",
-        n=len(fit.residual),
-        chi2=chi2,
-        method=METHOD,
-        fallback=INERTIA_FALLBACK,
-    )
+        value, value * math.hypot(own, scale_std, INERTIA_FLOOR), tolerance.inertia * value, "kg m2",
+        n=len(fit.residual), chi2=chi2, method=METHOD, fallback=INERTIA_FALLBACK,
+    )  # fmt: skip
 
 
 def _shown(lines: _Lines, rigid: Fit) -> tuple[str, float]:
@@ -409,13 +394,7 @@ def _shown(lines: _Lines, rigid: Fit) -> tuple[str, float]:
     return f"{load} would " + (f"show up to {highest:.3g} Hz" if highest else "not show at any frequency"), highest
 
 
-def _against(
-    fit: Fit,
-    chi2: float,
-    gain: float,
-    estimates: dict[str, Estimate],
-    frequency: Array,
-) -> str:
+def _against(fit: Fit, chi2: float, gain: float, estimates: dict[str, Estimate], frequency: Array) -> str:
     """Return what speaks against a second mass, empty where nothing does."""
     resonance, antiresonance = estimates["resonance_hz"], estimates["antiresonance_hz"]
     zeta = estimates["resonance_zeta"].value
