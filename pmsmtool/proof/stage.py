@@ -139,14 +139,21 @@ def _sagged(experiment: Experiment, trace: Trace, conditions: Conditions) -> str
 def envelope_of(design: Design, request: ProofRequest, plan: ProofPlan | None = None) -> Envelope:
     """Return the motion envelope: what the request says, else the design's largest current and speed.
 
-    On a supply that gives way less of both, so that a current at any speed leaves the DC link up.
+    On a supply that gives way less of both, so that a current at any speed leaves the DC link up: not less than what
+    is rated, where the supply gives that.
     """
     T_s, slope = design.machine.inverter.T_s, design["speed.acceleration_rpm_per_s"] * RPM
     i_max = design["motor.I_max_apk"] if request.i_max_apk is None else request.i_max_apk
     speed_max = design["motor.n_max_rpm"] * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s
     supply_w = design.machine.conditions.get(SUPPLY)
     if isinstance(supply_w, float):
-        i_max, speed_max = within_supply(supply_w, i_max, speed_max, abs(design.machine.machine.torque_nm(0.0, 1.0)))
+        per_ampere = abs(design.machine.machine.torque_nm(0.0, 1.0))
+        i_nom, rated_rad_s = min(i_max, design["motor.I_nom_apk"]), min(speed_max, rated_rpm(design) * RPM)
+        if 0.0 < i_nom * rated_rad_s * per_ampere <= supply_w:  # what is rated can be proven
+            i_max = max(i_nom, min(i_max, supply_w / (speed_max * per_ampere)))
+            speed_max = min(speed_max, supply_w / (i_max * per_ampere))
+        else:
+            i_max, speed_max = within_supply(supply_w, i_max, speed_max, per_ampere)
     return Envelope(
         i_max_apk=i_max,
         speed_max_rad_s=speed_max,
@@ -209,13 +216,16 @@ def prove_stage(
     return replace(stage, not_checked=_beyond(design, conditions))
 
 
+def rated_rpm(design: Design) -> float:
+    """Return the rated speed, the largest one where none is stated (rpm)."""
+    return design.machine.machine.n_nom_rpm or float(design["motor.n_max_rpm"])
+
+
 def _beyond(design: Design, conditions: Conditions) -> list[str]:
     """Return what a proof within its envelope leaves open of the machine's ratings."""
-    machine = design.machine.machine
-    rated_rpm = machine.n_nom_rpm or design["motor.n_max_rpm"]
     rows = (
         ("current", conditions.i_max_apk, design["motor.I_nom_apk"], "A pk"),
-        ("speed", conditions.speed_max_rad_s / RPM, rated_rpm, "rpm"),
+        ("speed", conditions.speed_max_rad_s / RPM, rated_rpm(design), "rpm"),
     )
     supply_w = design.machine.conditions.get(SUPPLY)
     limit = f": the DC link gives way at {supply_w:.3g} W" if isinstance(supply_w, float) else ""
