@@ -207,8 +207,14 @@ OLD_ANGLE: tuple[dict[str, Value], dict[str, Value]] = ({}, {"encoder_latency_s"
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize(("known", "settings"), [OF_MACHINE, OLD_ANGLE], ids=["machine", "age"])
-def test_what_identification_saw_is_in_the_band(known: dict[str, Value], settings: dict[str, Value]) -> None:
+@pytest.mark.parametrize(
+    ("known", "settings", "shown_by"),
+    [(*OF_MACHINE, ("speed_step", "q_steps", "d_steps")), (*OLD_ANGLE, ("q_steps", "d_steps"))],
+    ids=["machine", "age"],
+)
+def test_what_identification_saw_is_in_the_band(
+    known: dict[str, Value], settings: dict[str, Value], shown_by: tuple[str, ...]
+) -> None:
     age_s = settings.get("encoder_latency_s")
     source = machine()
     inverter = (
@@ -216,14 +222,14 @@ def test_what_identification_saw_is_in_the_band(known: dict[str, Value], setting
     )  # type: ignore[arg-type]
     design = tune(replace(source, conditions=known, inverter=inverter), TuneRequest(field_weakening="lookup"))
     with flashed(design, truth=replace(machine(), simulation={**machine().simulation, **settings})) as drive:
-        _, stage = prove(drive, design, asked=FEWER)
+        _, stage = prove(drive, design, asked=replace(FEWER, experiments=shown_by))
     assert stage.status == "pass", stage.note
 
 
 def test_a_healthy_drive_passes_within_a_small_current_limit(design: Design) -> None:
     """At full torque 5 A of the design's 12 A would all go into i_d, and the base speed would not be reached."""
     with flashed(design) as drive:
-        run, stage = prove(drive, design, asked=replace(FEWER, i_max_apk=5.0))
+        run, stage = prove(drive, design, asked=replace(FEWER, i_max_apk=5.0, experiments=("q_steps", "unreachable")))
     assert stage.status == "pass", stage.note
     (folder,) = (run.path / "prove").iterdir()
     prediction, traces = read_proof(folder)
@@ -239,14 +245,14 @@ def test_a_link_below_what_it_showed_at_rest_is_named(design: Design, monkeypatc
 
     monkeypatch.setattr(stages, "conditions_of", at_rest)
     with flashed(design) as drive:
-        _, stage = prove(drive, design, asked=FEWER)
+        _, stage = prove(drive, design, asked=replace(FEWER, experiments=("unreachable",)))
     assert stage.status == "fail" and "likely the voltage is too low" in stage.note
 
 
 def test_what_a_sagging_link_decides_is_not_judged(design: Design) -> None:
     """A supply that falls by 5 % under load is a healthy one, and what it gives decides at the voltage limit."""
     with flashed(design, truth=replace(machine(), simulation={"U_dc_source_ohm": 6.0})) as drive:
-        _, stage = prove(drive, design, asked=FEWER)
+        _, stage = prove(drive, design, asked=replace(FEWER, experiments=("q_steps", "unreachable")))
     assert stage.status == "pass", stage.note
     left = [line for line in stage.fallbacks if "not judged: under load the DC link falls from 540 to" in line]
     assert left and not [line for line in stage.acceptance if line.what.startswith("unreachable")]
@@ -330,7 +336,7 @@ def test_a_speed_that_is_not_reached_is_named(design: Design, monkeypatch: pytes
     monkeypatch.setattr(measured, "REACH_FACTOR", 0.0)
     monkeypatch.setattr(measured, "REACH_TIMES", 0.0)
     with flashed(design) as drive:
-        _, stage = prove(drive, design)
+        _, stage = prove(drive, design, asked=replace(FEWER, experiments=("speed_step", "q_steps")))
         assert is_safe(drive.node.state())
     assert stage.status == "fail"
     assert "the speed was not reached: " in stage.note and "before q_steps" in stage.note
