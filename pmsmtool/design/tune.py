@@ -37,27 +37,23 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.speed_noise import quieter, speed_noise
 from pmsmtool.machine.two_masses import shafts_of, why_slower
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import SATURATION
 
 PLL_PER_PERIOD = 0.1
 """Default pole of the speed estimate times T_s: a tenth of the sampling rate, 1200 rad/s at 12 kHz."""
-
 FILTER_PER_RATE = 1.0 / 60.0
 """Default cut-off of the speed filter over the sampling rate: 200 Hz at 12 kHz."""
-
 NOTCH_RATE_SHARE = 0.4
 """Largest resonance that gets a notch unasked, of the rate of the speed controller: half of it is the end."""
 SPEED_RATE_HZ = 1200.0
 """Default rate of the speed controller; the decimation is rounded to reach it."""
-
 ACCELERATION_SHARE = 0.8
 """Slope limit of the speed reference: this share of what the largest torque can accelerate."""
-
 FW_SHARE = 0.8
 """And at most this share of the slope at which field weakening falls behind by the whole voltage reserve."""
-
 _CURRENT_OPTIONS = 0b111
 _PREDICTOR_OPTION = 1 << 4
 
@@ -245,6 +241,10 @@ def _design_speed(
         return _Part(values, {}, {}, ("speed control is off: the machine file has no inertia J_kgm2", *notes))
     path = SpeedPath(J, source.machine.B_nms or 0.0, current.loop("q"), decimation, pll, filter_hz, notch)
     gains = _speed_gains(request, path, current.alpha)
+    share, why_quiet = quieter(source, gains.K_p * speed_noise(source, pll, filter_hz), rated.tau_max_nm)
+    if share < 1.0 and request.speed_bandwidth_hz is None:
+        gains = _speed_gains(replace(request, speed_bandwidth_hz=share * gains.omega_c / math.tau), path, current.alpha)
+        notes = (*notes, why_quiet)
     paths = [replace(path, shaft=shaft) for shaft in shafts_of(source)]
     if paths and request.speed_bandwidth_hz is None:
         rigid_rad_s, path, gains = gains.omega_c, paths[0], slowed(gains, paths)
