@@ -210,14 +210,14 @@ KEPT = 6
 
 
 class Shared:
-    """The last predictions by design and conditions: a drive is proven twice and more from one."""
+    """The last predictions by design, conditions and plan: a drive is proven twice and more from one."""
 
     def __init__(self) -> None:
         self.known: dict[str, Prediction] = {}
 
     def predict(self, design: Design, conditions: Any, plan: Any, **asked: Any) -> Prediction:
         """Return the prediction, made once."""
-        key = f"{design.content_hash()} {conditions} {asked}"
+        key = f"{design.content_hash()} {conditions} {[e.name for e in plan.experiments]} {asked}"
         if key not in self.known:
             while len(self.known) >= KEPT:
                 del self.known[next(iter(self.known))]
