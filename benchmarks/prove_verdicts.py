@@ -218,11 +218,11 @@ class Shared:
     def predict(self, design: Design, conditions: Any, plan: Any, **asked: Any) -> Prediction:
         """Return the prediction, made once."""
         key = f"{design.content_hash()} {conditions} {[e.name for e in plan.experiments]} {asked}"
-        if key not in self.known:
-            while len(self.known) >= KEPT:
-                del self.known[next(iter(self.known))]
-            self.known[key] = predict_proof(design, conditions, plan, **asked)
-        return self.known[key]
+        found = self.known.pop(key, None) or predict_proof(design, conditions, plan, **asked)
+        while len(self.known) >= KEPT:
+            del self.known[next(iter(self.known))]
+        self.known[key] = found  # the last one used
+        return found
 
 
 def one_drive(
