@@ -124,32 +124,14 @@ uint32_t pmsm_flux_map_flux(const pmsm_flux_map *map, double i_d, double i_q, do
 }
 
 /* The machine's edge in terms of the current found: the image of the map is not a rectangle. */
-static uint32_t current_status(const pmsm_flux_map *map, const double i[2], const place *p, const place *q)
+static uint32_t current_status(const pmsm_flux_map *map, const double i[2], int inside)
 {
     uint32_t status = 0u;
     if (!(i[0] >= map->i_d[0] && i[0] <= map->i_d[map->n_i_d - 1]))
         status |= PMSM_FLUX_MAP_OUTSIDE_I_D;
     if (!(i[1] >= map->i_q[0] && i[1] <= map->i_q[map->n_i_q - 1]))
         status |= PMSM_FLUX_MAP_OUTSIDE_I_Q;
-    if (!(p->beyond == 0.0 && q->beyond == 0.0))
-        status |= PMSM_FLUX_MAP_OUTSIDE_PSI;
-    return status;
-}
-
-uint32_t pmsm_flux_map_current(const pmsm_flux_map *map, double psi_d, double psi_q, double *i_d, double *i_q)
-{
-    const place p = place_equidistant(map->psi_d_min, map->psi_d_per_step, map->n_psi_d, psi_d);
-    const place q = place_equidistant(map->psi_q_min, map->psi_q_per_step, map->n_psi_q, psi_q);
-    double i[2];
-    uint32_t status;
-    if (p.beyond == 0.0 && q.beyond == 0.0)
-        cell_value(map->inverse_cells + ((ptrdiff_t)p.k * (map->n_psi_q - 1) + q.k) * CELL, p.x, q.x, i);
-    else
-        table_jacobian(map->inverse_cells, map->n_psi_q, p, q, i, NULL);
-    status = current_status(map, i, &p, &q);
-    *i_d = i[0];
-    *i_q = i[1];
-    return status;
+    return inside ? status : status | PMSM_FLUX_MAP_OUTSIDE_PSI;
 }
 
 uint32_t pmsm_flux_map_current_jacobian(const pmsm_flux_map *map, double psi_d, double psi_q, double i[2],
@@ -158,7 +140,35 @@ uint32_t pmsm_flux_map_current_jacobian(const pmsm_flux_map *map, double psi_d, 
     const place p = place_equidistant(map->psi_d_min, map->psi_d_per_step, map->n_psi_d, psi_d);
     const place q = place_equidistant(map->psi_q_min, map->psi_q_per_step, map->n_psi_q, psi_q);
     table_jacobian(map->inverse_cells, map->n_psi_q, p, q, i, jac);
-    return current_status(map, i, &p, &q);
+    return current_status(map, i, p.beyond == 0.0 && q.beyond == 0.0);
+}
+
+uint32_t pmsm_flux_map_current(const pmsm_flux_map *map, pmsm_flux_map_near *near, double psi_d, double psi_q,
+                               double *i_d, double *i_q)
+{
+    const double x = (psi_d - map->psi_d_min) * map->psi_d_per_step - near->k_d;
+    const double y = (psi_q - map->psi_q_min) * map->psi_q_per_step - near->k_q;
+    uint32_t status;
+    double i[2];
+    if (near->cell && x >= 0.0 && x < 1.0 && y >= 0.0 && y < 1.0) { /* no conversion to an index stands in the way */
+        cell_value(near->cell, x, y, i);
+        status = current_status(map, i, 1);
+    } else {
+        const place p = place_equidistant(map->psi_d_min, map->psi_d_per_step, map->n_psi_d, psi_d);
+        const place q = place_equidistant(map->psi_q_min, map->psi_q_per_step, map->n_psi_q, psi_q);
+        const int inside = p.beyond == 0.0 && q.beyond == 0.0;
+        near->cell = map->inverse_cells + ((ptrdiff_t)p.k * (map->n_psi_q - 1) + q.k) * CELL;
+        near->k_d = (double)p.k;
+        near->k_q = (double)q.k;
+        if (inside)
+            cell_value(near->cell, p.x, q.x, i);
+        else
+            table_jacobian(map->inverse_cells, map->n_psi_q, p, q, i, NULL);
+        status = current_status(map, i, inside);
+    }
+    *i_d = i[0];
+    *i_q = i[1];
+    return status;
 }
 
 static double magnitude(double v)
@@ -229,9 +239,10 @@ uint32_t pmsm_flux_map_flux_many(const pmsm_flux_map *map, int32_t n, const doub
 uint32_t pmsm_flux_map_current_many(const pmsm_flux_map *map, int32_t n, const double *psi_d, const double *psi_q,
                                     double *i_d, double *i_q, uint32_t *status)
 {
+    pmsm_flux_map_near near = {NULL, 0.0, 0.0};
     uint32_t all = 0u;
     for (int32_t m = 0; m < n; m++) {
-        const uint32_t one = pmsm_flux_map_current(map, psi_d[m], psi_q[m], i_d + m, i_q + m);
+        const uint32_t one = pmsm_flux_map_current(map, &near, psi_d[m], psi_q[m], i_d + m, i_q + m);
         if (status)
             status[m] = one;
         all |= one;

@@ -94,6 +94,7 @@ typedef struct {
     double friction_sign;          /* of the Coulomb torque during this interval: -1, 0, 1 */
     /* rotation over the last interval length and speed, a constant-speed run uses it again */
     double rotation_h, rotation_omega, half_cos, half_sin, full_cos, full_sin;
+    pmsm_flux_map_near near;
     double u_alpha, u_beta;        /* V, at the end of the last interval */
     double iron_alpha, iron_beta;  /* A, in the iron-loss resistor: the terminals carry it beside i_alpha, i_beta */
 } pmsm_plant;

@@ -141,6 +141,7 @@ void pmsm_plant_start(pmsm_plant *m, double theta_M, double omega_M)
     m->L_d_inverse = m->machine.map ? 0.0 : 1.0 / m->machine.L_d;
     m->L_q_inverse = m->machine.map ? 0.0 : 1.0 / m->machine.L_q;
     m->rotation_h = -1.0;
+    m->near.cell = NULL;
     m->u_alpha = m->u_beta = m->iron_alpha = m->iron_beta = 0.0;
     if (m->machine.map)
         find_zero_flux(m);

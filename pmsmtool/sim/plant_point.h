@@ -79,7 +79,7 @@ static inline void pmsm_find_currents(pmsm_plant *m, pmsm_point *at)
         psi_q -= h[1];
     }
     if (m->machine.map) {
-        if (pmsm_flux_map_current(m->machine.map, psi_d - m->psi_shift, psi_q, &at->i_d, &at->i_q))
+        if (pmsm_flux_map_current(m->machine.map, &m->near, psi_d - m->psi_shift, psi_q, &at->i_d, &at->i_q))
             m->outside_count++;
     } else {
         at->i_d = (psi_d - m->psi_m) * m->L_d_inverse;
