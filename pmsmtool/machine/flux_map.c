@@ -63,13 +63,13 @@ static place place_on_axis(const double *axis, double per_step, int32_t n, doubl
 /* ---- one cell ---------------------------------------------------------------------------------- */
 
 /* The two values only: Horner along y for the eight (a, k), then along x. */
-static void cell_value(const double *c, double x, double y, double f[2])
+static inline pmsm_flux_map_dq cell_value(const double *c, double x, double y)
 {
     double r[8];
     for (int j = 0; j < 8; j++)
         r[j] = ((c[24 + j] * y + c[16 + j]) * y + c[8 + j]) * y + c[j];
-    for (int k = 0; k < 2; k++)
-        f[k] = ((r[6 + k] * x + r[4 + k]) * x + r[2 + k]) * x + r[k];
+    const pmsm_flux_map_dq f = {((r[6] * x + r[4]) * x + r[2]) * x + r[0], ((r[7] * x + r[5]) * x + r[3]) * x + r[1]};
+    return f;
 }
 
 /* Values, slopes along x and y (per cell width), and the mixed second derivative where asked. */
@@ -124,12 +124,12 @@ uint32_t pmsm_flux_map_flux(const pmsm_flux_map *map, double i_d, double i_q, do
 }
 
 /* The machine's edge in terms of the current found: the image of the map is not a rectangle. */
-static uint32_t current_status(const pmsm_flux_map *map, const double i[2], int inside)
+static inline uint32_t current_status(const pmsm_flux_map *map, double i_d, double i_q, int inside)
 {
     uint32_t status = 0u;
-    if (!(i[0] >= map->i_d[0] && i[0] <= map->i_d[map->n_i_d - 1]))
+    if (!(i_d >= map->i_d[0] && i_d <= map->i_d[map->n_i_d - 1]))
         status |= PMSM_FLUX_MAP_OUTSIDE_I_D;
-    if (!(i[1] >= map->i_q[0] && i[1] <= map->i_q[map->n_i_q - 1]))
+    if (!(i_q >= map->i_q[0] && i_q <= map->i_q[map->n_i_q - 1]))
         status |= PMSM_FLUX_MAP_OUTSIDE_I_Q;
     return inside ? status : status | PMSM_FLUX_MAP_OUTSIDE_PSI;
 }
@@ -140,35 +140,40 @@ uint32_t pmsm_flux_map_current_jacobian(const pmsm_flux_map *map, double psi_d, 
     const place p = place_equidistant(map->psi_d_min, map->psi_d_per_step, map->n_psi_d, psi_d);
     const place q = place_equidistant(map->psi_q_min, map->psi_q_per_step, map->n_psi_q, psi_q);
     table_jacobian(map->inverse_cells, map->n_psi_q, p, q, i, jac);
-    return current_status(map, i, p.beyond == 0.0 && q.beyond == 0.0);
+    return current_status(map, i[0], i[1], p.beyond == 0.0 && q.beyond == 0.0);
 }
 
-uint32_t pmsm_flux_map_current(const pmsm_flux_map *map, pmsm_flux_map_near *near, double psi_d, double psi_q,
-                               double *i_d, double *i_q)
+/* The same where the cell has to be found. */
+static pmsm_flux_map_dq find_current(const pmsm_flux_map *map, pmsm_flux_map_near *near, double psi_d, double psi_q,
+                                     uint32_t *status)
+{
+    const place p = place_equidistant(map->psi_d_min, map->psi_d_per_step, map->n_psi_d, psi_d);
+    const place q = place_equidistant(map->psi_q_min, map->psi_q_per_step, map->n_psi_q, psi_q);
+    near->cell = map->inverse_cells + ((ptrdiff_t)p.k * (map->n_psi_q - 1) + q.k) * CELL;
+    near->k_d = (double)p.k;
+    near->k_q = (double)q.k;
+    if (p.beyond == 0.0 && q.beyond == 0.0) {
+        const pmsm_flux_map_dq i = cell_value(near->cell, p.x, q.x);
+        *status = current_status(map, i.d, i.q, 1);
+        return i;
+    }
+    double f[2];
+    table_jacobian(map->inverse_cells, map->n_psi_q, p, q, f, NULL);
+    const pmsm_flux_map_dq i = {f[0], f[1]};
+    *status = current_status(map, i.d, i.q, 0);
+    return i;
+}
+
+pmsm_flux_map_dq pmsm_flux_map_current(const pmsm_flux_map *map, pmsm_flux_map_near *near, double psi_d, double psi_q,
+                                       uint32_t *status)
 {
     const double x = (psi_d - map->psi_d_min) * map->psi_d_per_step - near->k_d;
     const double y = (psi_q - map->psi_q_min) * map->psi_q_per_step - near->k_q;
-    uint32_t status;
-    double i[2];
-    if (near->cell && x >= 0.0 && x < 1.0 && y >= 0.0 && y < 1.0) { /* no conversion to an index stands in the way */
-        cell_value(near->cell, x, y, i);
-        status = current_status(map, i, 1);
-    } else {
-        const place p = place_equidistant(map->psi_d_min, map->psi_d_per_step, map->n_psi_d, psi_d);
-        const place q = place_equidistant(map->psi_q_min, map->psi_q_per_step, map->n_psi_q, psi_q);
-        const int inside = p.beyond == 0.0 && q.beyond == 0.0;
-        near->cell = map->inverse_cells + ((ptrdiff_t)p.k * (map->n_psi_q - 1) + q.k) * CELL;
-        near->k_d = (double)p.k;
-        near->k_q = (double)q.k;
-        if (inside)
-            cell_value(near->cell, p.x, q.x, i);
-        else
-            table_jacobian(map->inverse_cells, map->n_psi_q, p, q, i, NULL);
-        status = current_status(map, i, inside);
-    }
-    *i_d = i[0];
-    *i_q = i[1];
-    return status;
+    if (!(near->cell && x >= 0.0 && x < 1.0 && y >= 0.0 && y < 1.0))
+        return find_current(map, near, psi_d, psi_q, status);
+    const pmsm_flux_map_dq i = cell_value(near->cell, x, y); /* no conversion to an index stood in the way */
+    *status = current_status(map, i.d, i.q, 1);
+    return i;
 }
 
 static double magnitude(double v)
@@ -242,7 +247,10 @@ uint32_t pmsm_flux_map_current_many(const pmsm_flux_map *map, int32_t n, const d
     pmsm_flux_map_near near = {NULL, 0.0, 0.0};
     uint32_t all = 0u;
     for (int32_t m = 0; m < n; m++) {
-        const uint32_t one = pmsm_flux_map_current(map, &near, psi_d[m], psi_q[m], i_d + m, i_q + m);
+        uint32_t one;
+        const pmsm_flux_map_dq i = pmsm_flux_map_current(map, &near, psi_d[m], psi_q[m], &one);
+        i_d[m] = i.d;
+        i_q[m] = i.q;
         if (status)
             status[m] = one;
         all |= one;

@@ -76,9 +76,13 @@ typedef struct pmsm_flux_map_near {
 /* Forward: psi = {psi_d, psi_q} (Wb); jac = {dpsi_d/di_d, dpsi_d/di_q, dpsi_q/di_d, dpsi_q/di_q} (H), or null. */
 uint32_t pmsm_flux_map_flux(const pmsm_flux_map *map, double i_d, double i_q, double psi[2], double *jac);
 
-/* Inverse, as the simulated machine: i from the inverse table (A). At least C1 in psi. */
-uint32_t pmsm_flux_map_current(const pmsm_flux_map *map, pmsm_flux_map_near *near, double psi_d, double psi_q,
-                               double *i_d, double *i_q);
+typedef struct {
+    double d, q;
+} pmsm_flux_map_dq; /* A; two numbers that are returned in registers */
+
+/* Inverse, as the simulated machine: i from the inverse table. At least C1 in psi. */
+pmsm_flux_map_dq pmsm_flux_map_current(const pmsm_flux_map *map, pmsm_flux_map_near *near, double psi_d, double psi_q,
+                                       uint32_t *status);
 
 /* Inverse with its Jacobian {di_d/dpsi_d, di_d/dpsi_q, di_q/dpsi_d, di_q/dpsi_q} (A/Wb). */
 uint32_t pmsm_flux_map_current_jacobian(const pmsm_flux_map *map, double psi_d, double psi_q, double i[2],

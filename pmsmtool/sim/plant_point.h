@@ -79,8 +79,12 @@ static inline void pmsm_find_currents(pmsm_plant *m, pmsm_point *at)
         psi_q -= h[1];
     }
     if (m->machine.map) {
-        if (pmsm_flux_map_current(m->machine.map, &m->near, psi_d - m->psi_shift, psi_q, &at->i_d, &at->i_q))
-            m->outside_count++;
+        uint32_t outside;
+        const pmsm_flux_map_dq i =
+            pmsm_flux_map_current(m->machine.map, &m->near, psi_d - m->psi_shift, psi_q, &outside);
+        m->outside_count += outside != 0u;
+        at->i_d = i.d;
+        at->i_q = i.q;
     } else {
         at->i_d = (psi_d - m->psi_m) * m->L_d_inverse;
         at->i_q = psi_q * m->L_q_inverse;
