@@ -65,12 +65,12 @@ double pmsm_random_normal(pmsm_random *random)
 
 /* ---- sensors ------------------------------------------------------------------------------------------ */
 
-/* Nearest integer, halves upwards. */
-static double nearest(double x)
+/* Nearest integer, halves upwards; without a branch, which noise would make unforeseeable. */
+static inline double nearest(double x)
 {
     const double whole = (double)(int64_t)x;
-    const double down = whole > x ? whole - 1.0 : whole;
-    return x - down >= 0.5 ? down + 1.0 : down;
+    const double down = whole - (whole > x ? 1.0 : 0.0);
+    return down + (x - down >= 0.5 ? 1.0 : 0.0);
 }
 
 double pmsm_sensor_current(const pmsm_sensor_setup *setup, pmsm_random *random, int x, double i, uint32_t *clipped)
