@@ -89,13 +89,9 @@ double pmsm_point_hold_voltage(const pmsm_plant *m, const pmsm_point *at, double
 
 void pmsm_plant_refresh(pmsm_plant *m)
 {
-    pmsm_point at;
     pmsm_real64_sincos(m->machine.pole_pairs * m->state.theta_M, &m->state.sin_e, &m->state.cos_e);
     m->state.turned = 0;
-    at.psi_alpha = m->state.psi_alpha;
-    at.psi_beta = m->state.psi_beta;
-    at.c = m->state.cos_e;
-    at.s = m->state.sin_e;
+    pmsm_point at = pmsm_point_here(&m->state);
     pmsm_find_currents(m, &at);
     pmsm_keep_point(m, &at);
 }

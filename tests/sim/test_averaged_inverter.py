@@ -354,6 +354,16 @@ def test_eddy_branch_lowers_the_inductance_that_fast_changes_see():
     assert slow[-1].real == pytest.approx(i, rel=1e-6)
 
 
+def test_eddy_currents_stay_when_temperatures_are_set():
+    def change(setup: Setup) -> None:
+        setup.machine.eddy_d, setup.machine.eddy_q, setup.machine.eddy_rate = 0.25 / L_D, 0.25 / L_Q, 500.0
+
+    simulation = open_simulation(change)
+    before = plant_run(simulation, np.full(20, 10.0 + 0j), 1e-5)[-1].real
+    simulation.library.pmsm_sim_set_temperatures(simulation.sim, 20.0, 20.0)
+    assert simulation.signal(Truth.I_D) == pytest.approx(before, rel=1e-12)
+
+
 @pytest.mark.parametrize("T_magnet_c", [20.0, 70.0])
 def test_flux_harmonics_are_in_the_back_emf_and_conserve_power(T_magnet_c: float):
     """They are the magnets', so they weaken with the fundamental."""
