@@ -65,7 +65,8 @@ judged by a twin."""
 AWAY = 0.15
 """Flux beside the twin's after the second good period, over what V_max changes in one; 0.123 at most of 10^6."""
 QUIET = 0.1
-"""A twin whose flux moves by less, in that unit, is steady: laws that no rule has tuned for a drawn machine swing."""
+"""A twin whose flux moves by less, in that unit, is steady: laws that no rule has tuned for a drawn machine swing. Nor
+may its voltage change by more of V_max in the bad period: held for that long, the old one moves the flux by as much."""
 
 
 def draw_machine(rng: np.random.Generator) -> dict[str, float]:
@@ -215,7 +216,10 @@ def episode(case: Case, rng: np.random.Generator, found: Counter[str]) -> float:
     before, start = voltage(loop.output), copy_of(loop)
     count, name = (2 if rng.uniform() < 0.2 else 1), str(rng.choice(case.inputs))
     value, word = float(rng.choice(POISON)), int(rng.integers(*case.words.get(name, (0, 1))))
-    for _ in range(count + 2):
+    case.good()
+    turned = before * cmath.exp(1j * loop.plant.omega * loop.plant.T_s)
+    changed = abs(voltage(loop.output) - turned) / case.V_max
+    for _ in range(count + 1):
         case.good()
     twin = loop.plant.i.copy()
     restore(loop, start)
@@ -225,7 +229,6 @@ def episode(case: Case, rng: np.random.Generator, found: Counter[str]) -> float:
         found["bad periods"] += 1
         found["no number with gates on"] += int(bool(loop.output.gates) and not np.isfinite(duties(loop.output)).all())
         if not usable and k == 0:
-            turned = before * cmath.exp(1j * loop.plant.omega * loop.plant.T_s)
             found["not held"] += int(abs(voltage(loop.output) - turned) > 1e-3 * case.V_max)
             found["latched by one"] += int(loop.state.fault != 0)
     if not usable and count == 2:
@@ -243,7 +246,8 @@ def episode(case: Case, rng: np.random.Generator, found: Counter[str]) -> float:
         case.good()
         found["no number with gates on"] += int(not np.isfinite(duties(loop.output)).all())
     away = case.flux(loop.plant.i - twin)
-    if (usable and (name != NODES or abs(value) < 1.0)) or case.law in NOT_TUNED or case.flux(twin - start[1]) > QUIET:
+    moved = max(changed, case.flux(twin - start[1]))
+    if (usable and (name != NODES or abs(value) < 1.0)) or case.law in NOT_TUNED or moved > QUIET:
         return 0.0
     found["judged by the twin"] += 1
     found["not back"] += int(not away <= AWAY or loop.output.gates == 0)
