@@ -63,10 +63,11 @@ def find_drive(source: str | Path | Design | MachineFile, params: Path | None = 
         No design for this machine.
     """
     from pmsmtool.design.design_file import load_machine_or_design
-    from pmsmtool.design.tune import tune
 
     machine, design = load_machine_or_design(source)
     if design is None:
+        from pmsmtool.design.tune import tune
+
         made = tune(machine)
         found = SimulatedDrive(machine, made.parameter_set(), "designed by the rules of `tune`", made.notes)
     else:
