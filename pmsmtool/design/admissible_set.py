@@ -293,7 +293,7 @@ class _Redundancy:
 def _unbounded(rows: Array, target: Array) -> bool:
     """Whether the target moves along a state that no disc holds."""
     flat = rows.reshape(-1, rows.shape[2])
-    _, sizes, directions = np.linalg.svd(flat)
+    _, sizes, directions = np.linalg.svd(flat, full_matrices=len(flat) < flat.shape[1])
     rank = int(np.sum(sizes > _RANK * sizes[0]))
     free = directions[rank:]
     return bool(free.size and np.abs(target @ free.T).max() > _RANK * np.abs(target).max())
@@ -313,7 +313,7 @@ def _furthest(
     while True:
         for _ in range(_NEWTON_STEPS):
             y = (x @ flat.T).reshape(len(x), -1, 2) + shift
-            room = square - (y * y).sum(axis=2)
+            room = square - np.einsum("nmk,nmk->nm", y, y)
             inside = room.min(axis=1) > _ROUNDING  # else on the border to rounding: nothing left to gain
             if not inside.any():
                 return x
@@ -340,8 +340,8 @@ def _furthest(
 
 def _inside_share(step: Array, y: Array, square: Array) -> Array:
     """Largest share of each step that stays inside every disc."""
-    a, b = (step * step).sum(axis=2), (step * y).sum(axis=2)
-    c = (y * y).sum(axis=2) - square
+    a, b, c = (np.einsum("nmk,nmk->nm", *pair) for pair in ((step, step), (step, y), (y, y)))
+    c -= square
     root = np.sqrt(np.maximum(b * b - a * c, 0.0))
     return np.asarray(((root - b) / np.maximum(a, _TINY)).min(axis=1))
 
