@@ -17,7 +17,7 @@ from pmsmtool.machine.two_masses import (
     damping_nms_per_rad,
     doubt,
     hides_play,
-    mechanics_of,
+    shafts_of,
 )
 from pmsmtool.sim.kernel import Setup, library
 from pmsmtool.sim.simulated_machine import MODELS, SHAPES
@@ -164,16 +164,23 @@ def _draw_harmonics(setup: Setup, machine: MachineFile, rng: np.random.Generator
 
 
 def _draw_elastic_shaft(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
-    """Divide the inertia into the two masses that resonance and antiresonance tell; nothing without them."""
+    """Divide the inertia into the two masses that resonance and antiresonance tell, or that a shaft with play may have.
+
+    Without either, nothing. A light rotor runs ahead within its play: 0.11 degrees and half of the inertia moved i_q by
+    0.1 of 2.2 A after steps of 3 ms.
+    """
     known, out = machine.machine, setup.machine
-    f_r, f_a = known.resonance_hz, known.antiresonance_hz
-    if f_r is None or f_a is None or not f_a < f_r or not known.J_kgm2:
+    if not (shafts := shafts_of(machine)):
         return
-    shaft = mechanics_of(machine)
-    if hides_play(machine):
+    shaft = shafts[0]
+    if known.resonance_hz is None:
+        shaft = shafts[int(rng.integers(len(shafts)))]
+    elif hides_play(machine):
         shaft = by_more_torque(shaft, float(rng.uniform(0.0, 1.0)))
+    if not shaft.elastic:
+        return
     places = {"resonance_hz": shaft.resonance_hz, "antiresonance_hz": shaft.antiresonance_hz}
-    halves = {name: doubt(machine, name, getattr(known, name)) for name in places}
+    halves = {name: doubt(machine, name, getattr(known, name) or place) for name, place in places.items()}
     w_r, w_a = (2.0 * math.pi * place * float(rng.uniform(*about(1.0, halves[name]))) for name, place in places.items())
     if w_a >= w_r:
         return
