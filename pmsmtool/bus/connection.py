@@ -119,6 +119,7 @@ class Connection:
         # Reentrant: on the simulated bus a heartbeat falls due while a frame is on the wire, in the same thread.
         self._send_lock = threading.RLock()
         self._pump_lock = threading.Lock()
+        self._trace_lock = threading.RLock()  # one thread sends frames, another receives them
         self._dispatching: int | None = None
         self._closing = False
         self._reader: threading.Thread | None = None
@@ -148,9 +149,10 @@ class Connection:
             self._reader.join(2 * _POLL_S)
         with contextlib.suppress(can.CanError, OSError):
             self.bus.shutdown()
-        if self._writer is not None:
-            self._writer.stop()
-            self._writer = None
+        with self._trace_lock:
+            if self._writer is not None:
+                self._writer.stop()
+                self._writer = None
 
     # ---- sending --------------------------------------------------------------------------------
 
@@ -356,7 +358,9 @@ class Connection:
 
     def _write(self, message: can.Message) -> None:
         try:
-            self._writer(message)
+            with self._trace_lock:
+                if self._writer is not None:
+                    self._writer(message)
         except (OSError, ValueError) as error:
             self._writer = None
             raise ConfigError(

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+import can
 import pytest
 
 from pmsmtool.bus.connect import Connection, connect
@@ -280,3 +281,30 @@ def test_a_stop_of_a_busy_drive_is_asked_for_until_it_answers() -> None:
             with pytest.raises(StopNotConfirmed, match="device state"):
                 quick_stop(node)
             assert bus.clock.now() < BUSY_S + 0.5
+
+
+def test_two_threads_never_write_the_bus_trace_at_once() -> None:
+    """A recorded bus had bytes of the memory in it: one thread wrote a sent frame, another a received one."""
+
+    class Writer:
+        inside = overlaps = frames = 0
+
+        def __call__(self, message: can.Message) -> None:
+            self.inside += 1
+            self.overlaps += self.inside > 1
+            time.sleep(1e-4)
+            self.inside -= 1
+            self.frames += 1
+
+        def stop(self) -> None:
+            self.overlaps += self.inside > 0
+
+    writer = Writer()
+    connection = Connection(ScriptedBus(ScriptedSlave({})), writer=writer)
+    workers = [threading.Thread(target=lambda: [connection.send(0x700, b"\x05") for _ in range(40)]) for _ in range(3)]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    connection.close()
+    assert writer.frames >= 120 and writer.overlaps == 0
