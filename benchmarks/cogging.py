@@ -181,7 +181,7 @@ def main() -> None:
     parser.add_argument("--drives", type=int, default=20)
     parser.add_argument("--first", type=int, default=91000)
     parser.add_argument("--names", nargs="+", help="profiles or random-<seed> instead")
-    parser.add_argument("--cogging", type=float, help="% of rated torque instead of the drawn one")
+    parser.add_argument("--cogging", type=float, help="%% of rated torque instead of the drawn one")
     parser.add_argument("--emf", type=float, default=1.0, help="factor on the drawn harmonics")
     parser.add_argument("--results", type=Path, default=Path("cogging.jsonl"))
     parser.add_argument("--keep", type=Path, default=Path("cogging_runs"), help="folder that keeps the runs")
