@@ -73,7 +73,7 @@ def envelope_of(nameplate: MachineFile, i_max_apk: float | None, speed_max_rad_s
     """Return what the check may do: a tenth of the rated current, half a turn, 15 s."""
     rated = nameplate.machine.I_nom_apk or i_max_apk or 0.0
     largest = HEADROOM * CURRENT_SHARE * rated
-    n_max = nameplate.machine.n_max_rpm
+    n_max = nameplate.machine.top_rpm
     fastest = rad_s_from_rpm(n_max) if n_max else SPEED_RAD_S
     speed = min(fastest, max(SPEED_RAD_S, SPEED_SHARE * fastest))
     return Envelope(
