@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -58,10 +59,13 @@ class CanopenDrive:
         Whether a stop may use the drive's quick stop ramp, which runs its speed loop; else it removes the voltage.
     commands_bounded_current : bool
         Whether every command is a current that this program bounds, so that it may replace a limit the drive lacks.
+    shows_apk : float
+        Largest current that the object holds by which the guard sees it (A peak).
     """
 
     stops_by_ramp = True
     commands_bounded_current = False
+    shows_apk = math.inf
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         self.node = DriveNode(connection, node_id, drive_map=drive_map)

@@ -12,7 +12,7 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.motion_objects import Quantity, allowed, current_limits, rated_apk, speed_limits
 from pmsmtool.errors import NotAvailable, SafetyRefusal, SdoAbort
-from pmsmtool.units import rpm_from_rad_s
+from pmsmtool.units import format_current, rpm_from_rad_s
 
 RATED_RATIO = 30.0
 """Largest current limit over the drive's rated current (0x6075): three times the rated current of a motor ten times as
@@ -54,13 +54,22 @@ def lower_limits(drive: CanopenDrive, envelope: Envelope) -> OwnLimits:
     Raises
     ------
     SafetyRefusal
-        The current limit is none beside the rated current, or the drive does not hold what was written.
+        The current limit is none beside the rated current, or beyond what the drive shows of its current; or the drive
+        does not hold what was written.
     NotAvailable
         The drive lacks a limit that nothing replaces.
     """
     node = drive.node
     rated = rated_apk(node)
     _refuse_no_limit(node, rated, envelope.i_max_apk)
+    if envelope.i_max_apk > drive.shows_apk:
+        raise SafetyRefusal(
+            f"the current limit of {format_current(envelope.i_max_apk)} cannot be watched: what the drive shows of its "
+            f"current ends at {format_current(drive.shows_apk)}",
+            where=f"node {node.node}",
+            likely="an object of 16 bits in mA, as a drive for small motors has it",
+            hint="limit the current to less (--i-max); nothing was energised",
+        )
     refused: list[str] = []
     current = _lowered(node, current_limits(node, rated), envelope.i_max_apk, refused)
     speed = _lowered(node, speed_limits(node), rpm_from_rad_s(envelope.speed_max_rad_s), refused)

@@ -83,6 +83,8 @@ class StandardDrive(CanopenDrive):
         self.counts_per_turn = position_units(self.node)
         self._rated_apk = rated_apk(self.node)
         self._current = shown_current(self.node, self._rated_apk)
+        bits = 8 * self.node.typed(self._current.item).size
+        self.shows_apk = self._current.per_count * ((1 << bits - 1) - 1)
 
     @property
     def rated_apk(self) -> float:

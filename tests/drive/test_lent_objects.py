@@ -492,7 +492,7 @@ RATED_APK = 4.0 * math.sqrt(2.0)
 def test_the_drives_own_limits_are_lowered_to_the_envelope(more: Held, bounded: bool, current: Any, speed: Any) -> None:
     """3 A of 5.66 A are 530.3 permille, 100 rad/s are 954.9 rpm: rounded up, and never raised."""
     with node_of({**RATED, **more}, GENERIC) as (table, node):
-        drive: Any = SimpleNamespace(node=node, commands_bounded_current=bounded)
+        drive: Any = SimpleNamespace(node=node, commands_bounded_current=bounded, shows_apk=math.inf)
         envelope = Envelope(i_max_apk=3.0, speed_max_rad_s=100.0)
         if current == "lacks":
             with pytest.raises(NotAvailable, match="no current and speed limit"):
@@ -512,7 +512,7 @@ def test_the_drives_own_limits_are_lowered_to_the_envelope(more: Held, bounded: 
 @pytest.mark.parametrize(("ratio", "refused"), [(29.9, False), (30.1, True), (math.inf, True), (math.nan, True)])
 def test_a_limit_of_more_than_thirty_times_the_rated_current_is_none(ratio: float, refused: bool) -> None:
     with node_of(RATED, GENERIC) as (_, node):
-        drive: Any = SimpleNamespace(node=node, commands_bounded_current=True)
+        drive: Any = SimpleNamespace(node=node, commands_bounded_current=True, shows_apk=math.inf)
         envelope = Envelope(i_max_apk=ratio * RATED_APK, speed_max_rad_s=100.0)
         if not refused:
             lower_limits(drive, envelope)
@@ -526,7 +526,7 @@ def test_a_limit_that_the_drive_does_not_hold_is_refused(holds: int, refused: bo
     with node_of({**RATED, objects.MAX_CURRENT_PERMILLE: 3000}, GENERIC) as (table, node):
         reads = [3000, holds]
         table.shown[objects.MAX_CURRENT_PERMILLE] = lambda: reads[bool(table.writes)]
-        drive: Any = SimpleNamespace(node=node, commands_bounded_current=True)
+        drive: Any = SimpleNamespace(node=node, commands_bounded_current=True, shows_apk=math.inf)
         envelope = Envelope(i_max_apk=3.0, speed_max_rad_s=100.0)
         if not refused:
             assert lower_limits(drive, envelope).most_apk == pytest.approx(531e-3 * RATED_APK)
