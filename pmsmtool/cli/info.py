@@ -80,8 +80,9 @@ def _parameter_set(node: DriveNode) -> dict[str, Any] | None:
 
 def _limits(node: DriveNode) -> dict[str, float | None]:
     from pmsmtool.drive import objects
+    from pmsmtool.drive.motion_objects import rated_ma
 
-    rated = _whole(node, objects.RATED_CURRENT_MA)
+    rated = rated_ma(node)
     return {
         "rated_current_arms": None if rated is None else rated / 1000.0,
         "max_speed_rpm": _whole(node, objects.MAX_SPEED_RPM),

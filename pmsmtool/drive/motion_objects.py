@@ -31,6 +31,9 @@ TORQUE_PERMILLE = DriveObject(0x6077, 0, "h")
 POLARITY = DriveObject(0x607E, 0, "B")
 GEAR_MOTOR, GEAR_SHAFT = DriveObject(0x6091, 1, "I"), DriveObject(0x6091, 2, "I")
 FEED, FEED_TURNS = DriveObject(0x6092, 1, "I"), DriveObject(0x6092, 2, "I")
+FACTOR, FACTOR_DIVISOR = DriveObject(0x6093, 1, "I"), DriveObject(0x6093, 2, "I")
+"""Increments of the encoder per unit of position (CiA 402 of 2002; its later editions leave it out)."""
+STATE_UNITS = "or state the units of a turn in a map (`counts_per_turn`)"
 POSITION_UNIT = DriveObject(0x60A8, 0, "I")
 PERIOD_VALUE, PERIOD_EXPONENT = DriveObject(0x60C2, 1, "B"), DriveObject(0x60C2, 2, "b")
 """Time between two targets of a cyclic mode, value times 10^exponent s (CiA 402-2, interpolation time period)."""
@@ -42,6 +45,10 @@ INCREMENTS = (0x00, 0xB5)
 """Numerators of units of the encoder; others, as metres, say nothing of a turn without the feed (0x6092)."""
 RATED_RMS = 1e-3 * math.sqrt(2.0)
 """A peak per count of 0x6075, taken as mA rms: the larger of the two readings."""
+MOST_RATED_MA = 1e7
+"""Largest rated current of a motor (mA). 0 and 0xFFFFFFFF are drives without a motor's data; a REAL32 reads as 1e9."""
+SAME_UNITS = 1e-6
+"""Two statements of the units of a turn, whole numbers and ratios of them, that differ by less are one."""
 LEAST_UNITS = 24
 """Fewest units of position per turn: one within the 50 ms between two looks at the speed is 5 rad/s then. Files of
 makers say 1 where nothing was set up."""
@@ -117,9 +124,15 @@ def _own(node: DriveNode, name: str) -> Quantity | None:
     return Quantity(DriveObject(row.index, row.sub, LETTERS[row.wire]), row.per_count, row.undecided)
 
 
+def rated_ma(node: DriveNode) -> float | None:
+    """Return what 0x6075 holds; None where the drive has none, or a number that no motor has: it was never set."""
+    held = node.held(objects.RATED_CURRENT_MA)
+    return held if held is not None and 0.0 < held <= MOST_RATED_MA else None
+
+
 def rated_current(node: DriveNode) -> Quantity | None:
     """Return where the rated current stands; None where nobody knows."""
-    if node.held(objects.RATED_CURRENT_MA) is not None:
+    if rated_ma(node) is not None:
         return Quantity(objects.RATED_CURRENT_MA, RATED_RMS)
     return _own(node, "rated_current")
 
@@ -132,7 +145,7 @@ def rated_apk(node: DriveNode) -> float:
     NotAvailable
         The drive does not say.
     """
-    found = node.held(objects.RATED_CURRENT_MA)
+    found = rated_ma(node)
     if found is not None:
         return RATED_RMS * found
     row = node.map.motion.get("rated_current")
@@ -266,50 +279,77 @@ def limited_speed(node: DriveNode) -> LimitedSpeed:
 def position_units(node: DriveNode) -> float:
     """Return the units of 0x6064 per turn of the motor, negative where its polarity (0x607E) turns it.
 
+    Where the drive's objects do not tell, the number that its owner states in a map does.
+
     Raises
     ------
     NotAvailable
-        Nothing tells, a gear (0x6091) stands between and nothing says in which units, or a turn has too few of them.
+        Nothing tells, a gear (0x6091) or a factor (0x6093) stands between and nothing says in which units, or a turn
+        has too few of them.
     """
-    units = _position_units(node)
-    if not abs(units) >= LEAST_UNITS:
+    if node.held(POSITION) is None:
+        raise NotAvailable("the drive shows no position", where=f"node {node.node}, 0x6064")
+    sign = -1.0 if int(node.held(POLARITY) or 0) & POSITION_TURNED else 1.0
+    row = node.map.motion.get("counts_per_turn")
+    try:
+        return sign * _position_units(node)
+    except NotAvailable:
+        if row is None or not row.number:
+            raise
+    return sign * _fine_enough(node, row.number)
+
+
+def _fine_enough(node: DriveNode, units: float) -> float:
+    if not units >= LEAST_UNITS:
         raise NotAvailable(
-            f"a turn of the motor has {abs(units):.4g} units of position, {LEAST_UNITS} are needed to see its speed",
+            f"a turn of the motor has {units:.4g} units of position, {LEAST_UNITS} are needed to see its speed",
             where=f"node {node.node}, 0x608F or 0x6092",
             likely="the encoder's resolution or the feed was never set",
-            hint="set it with the maker's software",
+            hint=f"set it with the maker's software, {STATE_UNITS}",
         )
     return units
 
 
 def _position_units(node: DriveNode) -> float:
-    sign = -1.0 if int(node.held(POLARITY) or 0) & POSITION_TURNED else 1.0
+    units = _fine_enough(node, _shown_units(node))
+    factor = max(1.0, node.held(FACTOR) or 1.0) / max(1.0, node.held(FACTOR_DIVISOR) or 1.0)
+    counts = (node.held(ENCODER_COUNTS) or 0.0) / max(1.0, node.held(MOTOR_TURNS) or 1.0)
+    if factor != 1.0 and not math.isclose(units * factor, counts, rel_tol=SAME_UNITS):
+        raise NotAvailable(
+            f"a position factor of {factor:.4g} is set (0x6093), and nothing says what the position counts",
+            where=f"node {node.node}, 0x6093", hint=f"set it to 1:1 with the maker's software, {STATE_UNITS}",
+        )  # fmt: skip
+    return units
+
+
+def _shown_units(node: DriveNode) -> float:
     gear = max(1.0, node.held(GEAR_MOTOR) or 1.0) / max(1.0, node.held(GEAR_SHAFT) or 1.0)
     unit = int(node.held(POSITION_UNIT) or 0)
     numerator, exponent = unit >> 16 & 0xFF, unit >> 24
     if numerator in TURN_IN:
-        return sign * TURN_IN[numerator] / 10.0 ** (exponent - 256 if exponent > 127 else exponent) / gear
+        return TURN_IN[numerator] / 10.0 ** (exponent - 256 if exponent > 127 else exponent) / gear
     feed = node.held(FEED) or 1.0
     if feed > 1.0:
-        return sign * feed / max(1.0, node.held(FEED_TURNS) or 1.0) / gear
+        return feed / max(1.0, node.held(FEED_TURNS) or 1.0) / gear
     if numerator not in INCREMENTS:
         raise NotAvailable(
             f"the position is in a unit that says nothing of a turn (0x60A8 = {unit:#010x}), and no feed is set",
-            where=f"node {node.node}, 0x60A8", hint="set the feed (0x6092), or the unit, with the maker's software",
+            where=f"node {node.node}, 0x60A8",
+            hint=f"set the feed (0x6092), or the unit, with the maker's software, {STATE_UNITS}",
         )  # fmt: skip
     if gear != 1.0:
         raise NotAvailable(
             f"a gear of {gear:.4g} is set (0x6091), and the position may be of the motor or behind it",
-            where=f"node {node.node}, 0x6091", hint="set it to 1:1, or the feed (0x6092), with the maker's software",
+            where=f"node {node.node}, 0x6091",
+            hint=f"set it to 1:1, or the feed (0x6092), with the maker's software, {STATE_UNITS}",
         )  # fmt: skip
     counts = node.held(ENCODER_COUNTS)
     if counts is not None:
-        return sign * counts / max(1.0, node.held(MOTOR_TURNS) or 1.0)
-    row = node.map.motion.get("counts_per_turn")
-    if row is None:
-        raise NotAvailable(f"the drive does not report {NO_COUNTS}", where=f"node {node.node}")
+        return counts / max(1.0, node.held(MOTOR_TURNS) or 1.0)
     own = _own(node, "counts_per_turn")
-    return sign * (row.number if own is None else own.per_count * node.get(own.item))
+    if own is None:
+        raise NotAvailable(f"the drive does not report {NO_COUNTS}", where=f"node {node.node}")
+    return own.per_count * node.get(own.item)
 
 
 def current_limits(node: DriveNode, rated: float) -> Iterator[Quantity]:

@@ -68,8 +68,8 @@ FEATURES: Mapping[str, str] = {
     "recorder": "a recorder of currents and voltages that this program reads",
     "torque mode": "torque mode (0x6502 bit 3 or 9)",
     "push": "torque mode (0x6502 bit 3 or 9), or a velocity mode whose unit a map states, with a current limit",
-    "position": "position in increments of a known number per turn (0x6064 with 0x608F, or in a map: an object, or a "
-    "number)",
+    "position": "position in units of a known number per turn (0x6064 with 0x608F, no gear or factor in 0x6091 and "
+    "0x6093, or in a map: an object, or a number)",
     "encoder": "an encoder: between two edges of Hall sensors (hall.commutation) the angle is not measured",
     "frame": "a frame that turns with the rotor: not six steps (hall.commutation 3; 2 for this time)",
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
@@ -403,7 +403,7 @@ def _motion(node: DriveNode, rated: float | None) -> dict[str, bool]:
     torque = _told(lambda: torque_target(node, base)) is not None
     return {
         "rated current": rated is not None,
-        "position": node.has(0x6064, 0) and bool(_told(lambda: position_units(node))),
+        "position": bool(_told(lambda: position_units(node))),
         "current": _told(lambda: shown_current(node, base)) is not None,
         "torque mode": torque,
         "push": torque or _told(lambda: limited_speed(node)) is not None,

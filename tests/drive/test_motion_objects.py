@@ -35,7 +35,7 @@ def own(unit: str, index: int = 0x3001, sub: int = 1, *, wire: str = "UNSIGNED16
 @contextmanager
 def drive(held: Held, signals: dict[str, SignalCell] | None = None, /, **rows: MotionObject) -> Iterator[DriveNode]:
     drive_map: DriveMap = replace(GENERIC, motion=rows, signals=signals or {})
-    with node_of(held, drive_map) as (_, node):
+    with node_of({motion.POSITION: 0, **held}, drive_map) as (_, node):
         yield node
 
 
@@ -50,6 +50,8 @@ def drive(held: Held, signals: dict[str, SignalCell] | None = None, /, **rows: M
         ({}, {"rated_current": MotionObject(unit=RMS, number=500.0)}, 5.0 * math.sqrt(2.0), None),
         ({}, {"rated_current": own(PEAK)}, None, "0x3001:01"),
         ({}, {}, None, None),
+        ({objects.RATED_CURRENT_MA: 0}, {}, None, None),  # never set
+        ({objects.RATED_CURRENT_MA: 0xFFFF_FFFF, OWN: 700}, {"rated_current": own(PEAK)}, 7.0, "0x3001:01"),
     ],
 )  # fmt: skip
 def test_rated_current(held: Held, rows: dict[str, MotionObject], apk: float | None, where: str | None) -> None:

@@ -6,7 +6,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-TYPES = {"I8": 2, "I16": 3, "I32": 4, "U8": 5, "U16": 6, "U32": 7, "VSTR": 9, "U64": 0x1B}
+from pmsmtool.data_types import BY_SHORT
+
+TYPES = {short: row.code for short, row in BY_SHORT.items()}
 Row = tuple[int, int, str, str, str]
 """Index, sub-index, type, access, stored value."""
 

@@ -7,13 +7,16 @@ import json
 import math
 import random
 import re
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from benchmarks.eds_nodes import entries_of, faults_of, mutated, text_of
-from pmsmtool.drive.motion_objects import position_units
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.motion_objects import POSITION, position_units, rated_apk
+from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.errors import NotAvailable
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.sim.foreign import laws
@@ -126,7 +129,7 @@ def test_a_position_that_cannot_be_read_moves_nothing(tmp_path: Path, tool: Tool
     rows = [*(each for each in epos4() if each[0] != 0x6064), (0x6064, 0, "I32", "wo", "")]
     channel = f"interior-2k2?nv=:memory:&eds={write_eds(tmp_path / 'x.eds', rows)}"
     code, _, said = tool("--sim", channel, "--yes", "check", str(machine_path("interior-2k2")))
-    assert code == 9 and "position in increments" in said and "supervision tested" not in said
+    assert code == 9 and "position in units" in said and "supervision tested" not in said
 
 
 def checked(tool: Tool, rows: tuple[Row, ...]) -> tuple[int, dict[str, str], str]:
@@ -179,6 +182,54 @@ def test_a_length_says_nothing_of_a_turn_without_a_feed(tmp_path: Path) -> None:
     feed = ((0x6092, 1, "U32", "rw", "6000"), (0x6092, 2, "U32", "rw", "1"))
     with opened(write_eds(tmp_path / "y.eds", unknown("0x2D", metre, *feed))) as node:
         assert position_units(node) == 6000.0
+
+
+def with_map(node: DriveNode, counts_per_turn: str) -> DriveNode:
+    """Give a node the map of its owner, with that number from the name plate."""
+    node.map = parse_drive_map(
+        'schema = "pmsmtool.drive-map/1"\nname = "mine"\nvendor = 0x1DD\nproduct = 0x10305070\n[motion]\n'
+        f'counts_per_turn = {{ number = {counts_per_turn}, source = "plate" }}\n[sources]\nplate = "name plate"\n',
+        "mine.toml",
+    )
+    return node
+
+
+@pytest.mark.parametrize(
+    ("rows", "units"),
+    [
+        (((0x6093, 1, "U32", "rw", "128"), (0x6093, 2, "U32", "rw", "1")), None),
+        (((0x6093, 1, "U32", "rw", "6"), (0x6093, 2, "U32", "rw", "6")), 131072.0),
+        (((0x6092, 1, "U32", "rw", "4096"), (0x6093, 1, "U32", "rw", "32"), (0x6093, 2, "U32", "rw", "1")), 4096.0),
+        (((0x6091, 1, "U32", "rw", "50"), (0x6091, 2, "U32", "rw", "1")), None),
+        (((0x608F, 1, "U32", "ro", "5"),), None),
+    ],
+)
+def test_a_factor_or_gear_of_unknown_meaning_moves_nothing_until_its_owner_states_the_units(
+    tmp_path: Path, rows: tuple[Row, ...], units: float | None
+) -> None:
+    """J was 128 times the true one behind a factor of 128; the map that 'caps' printed for a gear was not read."""
+    with opened(write_eds(tmp_path / "x.eds", unknown("0x2D", *rows))) as node:
+        if units is None:
+            with pytest.raises(NotAvailable, match="counts_per_turn"):
+                position_units(node)
+        else:
+            assert position_units(node) == units
+        assert position_units(with_map(node, "1024")) == (units or 1024.0)
+
+
+ODD_NUMBERS: tuple[Row, ...] = (
+    (0x6075, 0, "REAL32", "rw", "4300.0"), (0x6064, 0, "I64", "ro", ""), (0x2003, 0, "REAL64", "rw", "1e-300"),
+)  # fmt: skip
+
+
+def test_numbers_of_types_that_the_standard_does_not_have_there(tmp_path: Path) -> None:
+    """A rated current of 1.2e6 A, a transfer of 8 bytes that ended the motion, a limit that ended in a traceback."""
+    path = write_eds(tmp_path / "x.eds", unknown("0x2D", *ODD_NUMBERS), {(0x2003, 0): (-(10**300), 10**300)})
+    with opened(path) as node:
+        with pytest.raises(NotAvailable, match="0x6075"):
+            rated_apk(node)
+        assert position_units(node) == 131072.0 and node.get(POSITION) != 0.0
+        assert struct.unpack("<d", node.sdo.read(0x2003, 0, size=8)) == (1e-300,)
 
 
 NO_MODE_11 = {(0x6060, 0): (-128, 10)}

@@ -24,10 +24,10 @@ FAMILY_MARK = "#"
 """Between the path of a table and the family whose rows are meant: ``objects.csv#maker``."""
 COLUMNS = ("family", "index", "sub", "name", "type", "access", "default_or_stored", "low", "high")
 """Columns a table needs."""
-_KEPT_AS = {"BOOL": "U8", "I64": "U64", "OSTR": "VSTR", "USTR": "VSTR"}
+_KEPT_AS = {"BOOL": "U8", "OSTR": "VSTR", "USTR": "VSTR"}
 _LONG = {kind.name: _KEPT_AS.get(short, short) for short, kind in BY_SHORT.items()}
 _CODES = {kind.code: _KEPT_AS.get(short, short) for short, kind in BY_SHORT.items()}
-"""CiA 301 data types by number and by name; one of 64 bits with a sign is kept as its bytes."""
+"""CiA 301 data types by number and by name."""
 _ACCESS = {"ro": "ro", "const": "const", "wo": "wo", "rw": "rw", "rwr": "rw", "rww": "rw"}
 MAPPINGS = frozenset((*range(0x1600, 0x1800), *range(0x1A00, 0x1C00)))
 """Mapping of the PDOs: its number of entries is written when it changes (CiA 301, 7.5.2.36 and 7.5.2.38)."""

@@ -68,7 +68,8 @@ def position_units(objects: MakersObjects, counts: int) -> float:
     feed, shaft = objects.stored(0x6092, 1), max(1, objects.stored(0x6092, 2))
     if feed > 1:
         return feed / shaft / gear
-    return encoder_resolution(objects, counts) / max(1, objects.stored(0x608F, 2))
+    scale = max(1, objects.stored(0x6093, 1)) / max(1, objects.stored(0x6093, 2))  # increments per unit (CiA 402, 2002)
+    return encoder_resolution(objects, counts) / max(1, objects.stored(0x608F, 2)) / scale
 
 
 def encoder_resolution(objects: MakersObjects, counts: int) -> float:

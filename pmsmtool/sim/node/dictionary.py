@@ -42,8 +42,7 @@ class Entry:
         kind = row.data_type
         self.size = kind.size
         self.code = struct.Struct("<" + kind.letter) if kind.letter else None
-        self.low = _as_binary32(row.low) if kind.is_float else row.low
-        self.high = _as_binary32(row.high) if kind.is_float else row.high
+        self.low, self.high = (_held_as(self.code, bound) if kind.is_float else bound for bound in (row.low, row.high))
         self.nan_allowed = row.default == "nan"
         self.readable = row.access != "wo"
         self.writable = row.access in ("rw", "wo")
@@ -71,7 +70,7 @@ class Entry:
         code = self.code
         if code is None:
             raise TypeError(f"{self.row.key} is not a number")
-        if code.format == "<f":
+        if self.row.data_type.is_float:
             return code.pack(number)
         bits = 8 * self.size
         signed = self.row.type.startswith("I")
@@ -97,7 +96,7 @@ class Entry:
         if code is None:
             return
         value = code.unpack(data)[0]
-        if code.format == "<f" and not math.isfinite(value):
+        if self.row.data_type.is_float and not math.isfinite(value):
             if not (self.nan_allowed and math.isnan(value)):
                 raise Refused(AbortCode.VALUE)
             return
@@ -107,11 +106,12 @@ class Entry:
             raise Refused(AbortCode.VALUE_LOW)
 
 
-def _as_binary32(bound: float | None) -> float | None:
-    if bound is None:
+def _held_as(code: struct.Struct | None, bound: float | None) -> float | None:
+    """Return a bound as its type holds it; None where it lies beyond every number of the type, and says nothing."""
+    try:
+        return None if bound is None or code is None else float(code.unpack(code.pack(bound))[0])
+    except OverflowError:
         return None
-    rounded: float = struct.unpack("<f", struct.pack("<f", bound))[0]
-    return rounded
 
 
 class Dictionary:
