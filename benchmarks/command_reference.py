@@ -27,7 +27,7 @@ END = "<!-- end of the command reference -->"
 _SHARED: tuple[tuple[str, frozenset[str]], ...] = (
     ("bus", frozenset({"interface", "channel", "bitrate", "node", "sim", "trace_can"})),
     ("motion", frozenset({"i_max", "speed_max", "shaft", "serial", "load", "brake", "yes"})),
-    ("write", frozenset({"i_max", "speed_max", "shaft", "serial", "yes"})),
+    ("write", frozenset({"serial", "yes"})),
     ("output", frozenset({"json_output", "verbose", "quiet"})),
     ("text", frozenset({"verbose", "quiet"})),
 )
@@ -48,7 +48,10 @@ def reference() -> str:
 def _shared_text() -> str:
     lines = ["Options that many commands share are named by their group in brackets:", ""]
     seen: set[str] = set()
-    known = {parameter.name: parameter for row in COMMANDS for parameter in _parameters(row)}
+    known: dict[str | None, click.Parameter] = {}
+    for row in COMMANDS:  # the first that has one: a command that moves says of --yes what the later ones leave out
+        for parameter in _parameters(row):
+            known.setdefault(parameter.name, parameter)
     for name, members in _SHARED:
         found = [known[member] for member in known if member in members]
         if found and not {parameter.name for parameter in found} <= seen:
@@ -67,7 +70,7 @@ def _parameters(row: Row) -> Iterator[click.Parameter]:
 def _command_text(typed: str, command: click.Command) -> str:
     context = click.Context(command, info_name=typed)
     pieces = [PROGRAM, typed, *(p.make_metavar(context) for p in command.params if isinstance(p, click.Argument))]
-    own = [p for p in command.params if isinstance(p, click.Option)]
+    own = [p for p in command.params if isinstance(p, click.Option) and not p.hidden]
     names = {p.name for p in own}
     groups = []
     for name, members in _SHARED:

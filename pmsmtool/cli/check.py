@@ -87,9 +87,10 @@ def _conclude(out: Output, found: list[Finding], stated_by: str = "") -> None:
     )
     wrong = [finding for finding in found if finding.verdict == WRONG]
     if wrong:
-        first = wrong[0]
+        first, *others = wrong
+        also = f"; wrong, too: {', '.join(each.looked_at for each in others)}" if others else ""
         raise CheckFailed(
-            f"{first.looked_at}: {first.shown}", likely=first.likely,
+            f"{first.looked_at}: {first.shown}{also}", likely=first.likely,
             hint=f"{stated_by}switch off, correct it, and check again",
         )  # fmt: skip
     unseen = [finding.looked_at for finding in found if finding.verdict in (NOT_SEEN, NOT_CHECKED)]

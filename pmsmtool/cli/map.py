@@ -86,7 +86,7 @@ def learn_command(
     asked = _addresses(names)
     file = load_machine_file(machine_path)
     machine = file.machine
-    if not machine.J_kgm2 or not machine.n_max_rpm:
+    if not machine.J_kgm2 or not machine.top_rpm:
         raise ConfigError(
             "the scale of a gain rests on the inertia, and the speed limit on the largest speed",
             where=f"{machine_path}: [machine]", hint="add J_kgm2 and n_max_rpm",
@@ -99,7 +99,7 @@ def learn_command(
         found = {}
         for name in (GAIN, INTEGRAL):
             found[name] = gain_object(node, name, *(asked.get(name) or gain_address(node, name)))
-        speed_max = motion.speed_max_rad_s or SPEED_SHARE * rad_s_from_rpm(machine.n_max_rpm)
+        speed_max = motion.speed_max_rad_s or SPEED_SHARE * rad_s_from_rpm(machine.top_rpm)
         i_max = within_budget(drive, machine, motion.i_max_apk or drive.rated_apk, speed_max)
         envelope = Envelope(
             i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S, shaft=motion.shaft or "free",

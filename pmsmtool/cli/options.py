@@ -192,22 +192,30 @@ def _verbosity_parameters(auto: bool) -> list[Option]:
     ]
 
 
-def _yes_parameter(auto: bool) -> Option:
+def _yes_parameter(auto: bool, moves: bool = True) -> Option:
+    limits = ", and where the machine moves with --i-max, --speed-max and --shaft" if moves else ""
     return click.option(
         "--yes",
         is_flag=True,
         allow_from_autoenv=False,  # consent is typed, never inherited from a shell's environment
-        help="Answer the prompts; on a real bus only with --serial, and where the machine moves with --i-max, "
-        "--speed-max and --shaft.",
+        help=f"Answer the prompts; on a real bus only with --serial{limits}.",
     )
 
 
-_ENVELOPE_PARAMETERS: tuple[Option, ...] = (
-    click.option("--i-max", type=LARGEST_CURRENT, metavar="CURRENT", help="Largest current, e.g. 12Apk or 8.5Arms."),
-    click.option("--speed-max", type=LARGEST_SPEED, metavar="SPEED", help="Largest speed of the shaft, e.g. 1200rpm."),
-    click.option("--shaft", type=click.Choice(["free", "locked", "coupled"]), help="What the shaft may do."),
-    click.option("--serial", type=SERIAL, metavar="NUMBER", help="Serial number the drive must have."),
-)
+def _envelope_parameters(moves: bool) -> tuple[Option, ...]:
+    """Return the limits of a motion and the serial number; what moves nothing lists no limits, but takes them."""
+    unlisted = not moves
+    return (
+        click.option("--i-max", type=LARGEST_CURRENT, metavar="CURRENT", hidden=unlisted,
+                     help="Largest current, e.g. 12Apk or 8.5Arms."),
+        click.option("--speed-max", type=LARGEST_SPEED, metavar="SPEED", hidden=unlisted,
+                     help="Largest speed of the shaft, e.g. 1200rpm."),
+        click.option("--shaft", type=click.Choice(["free", "locked", "coupled"]), hidden=unlisted,
+                     help="What the shaft may do."),
+        click.option("--serial", type=SERIAL, metavar="NUMBER", help="Serial number the drive must have."),
+    )  # fmt: skip
+
+
 _SURROUNDINGS_PARAMETERS: tuple[Option, ...] = (
     click.option("--load", type=click.Choice(["none", "gravity"]), default="none", help="What pulls on the shaft."),
     click.option("--brake", type=click.Choice(["open", "drive", "none"]), default="none", help="Holding brake."),
@@ -427,9 +435,9 @@ def _allowing(function: Function, options: tuple[Option, ...]) -> Function:
 
 def motion_options(function: Function) -> Function:
     """Add the envelope and ``--yes`` to a command that moves the machine; it receives ``motion: MotionOptions``."""
-    return _allowing(function, (*_ENVELOPE_PARAMETERS, *_SURROUNDINGS_PARAMETERS, _yes_parameter(False)))
+    return _allowing(function, (*_envelope_parameters(True), *_SURROUNDINGS_PARAMETERS, _yes_parameter(False)))
 
 
 def write_options(function: Function) -> Function:
     """Add ``--yes`` and what it needs to a command that writes the drive; it receives ``motion: MotionOptions``."""
-    return _allowing(function, (*_ENVELOPE_PARAMETERS, _yes_parameter(False)))
+    return _allowing(function, (*_envelope_parameters(False), _yes_parameter(False, moves=False)))

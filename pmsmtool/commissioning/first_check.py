@@ -52,9 +52,11 @@ ABOUT = {"E_CURRENT_SENSOR": "current sensors", "E_SNR": "current sensors"}
 """What a refusal of the phase check is about, where that is not the phases."""
 ALL = ("supply", "phases", "current sensors", "shaft", "pole pairs", "encoder sign")
 ORDER = (
-    "safe torque off", "supply", "limit switches", "current sensors", "phases", "shaft", "encoder counts", "pole pairs",
-    "encoder sign", "Hall wires",
+    "safe torque off", "supply", "limit switches", "current sensors", "phases", "shaft", "encoder sign",
+    "encoder counts", "pole pairs", "Hall wires",
 )  # fmt: skip
+"""Rows of the table. The sign is seen whatever is stated; counts and pole pairs are compared with what is, and a drive
+that was never set up states another motor's."""
 TURNED_BY = "a load that turns the shaft; wrong counts per turn or pole pairs"
 FAULTS = (
     ("does not enable", "safe torque off", "safe torque off or the enable input open; no DC link"),
@@ -73,7 +75,7 @@ def envelope_of(nameplate: MachineFile, i_max_apk: float | None, speed_max_rad_s
     """Return what the check may do: a tenth of the rated current, half a turn, 15 s."""
     rated = nameplate.machine.I_nom_apk or i_max_apk or 0.0
     largest = HEADROOM * CURRENT_SHARE * rated
-    n_max = nameplate.machine.n_max_rpm
+    n_max = nameplate.machine.top_rpm
     fastest = rad_s_from_rpm(n_max) if n_max else SPEED_RAD_S
     speed = min(fastest, max(SPEED_RAD_S, SPEED_SHARE * fastest))
     return Envelope(

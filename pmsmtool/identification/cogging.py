@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +29,7 @@ from pmsmtool.estimators.angle_harmonics import (
 )
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
 from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.shaft.mechanics import POWERED, Torque
 from pmsmtool.estimators.shaft.position import encoder_step
 from pmsmtool.identification.mechanics import in_frame, torque_of
 from pmsmtool.machine.parameters import Estimate
@@ -133,8 +134,8 @@ def cogging_of(traces: Mapping[str, Trace], result: Evaluation) -> Cogging | Non
         return None
     pole_pairs = round(result.encoder.pole_pairs.value)
     highest = min(HIGHEST_ORDER, ORDERS_PER_POLE_PAIR * pole_pairs)
+    torque = torque_of(result, pole_pairs)
     if slow:
-        torque = torque_of(result, pole_pairs)
         behind = result.offset.value - float(slow[0].meta["offset_rad"])
         both, friction = [], 0.0
         step = encoder_step([trace["theta_M_rad"] for trace in slow])
@@ -151,8 +152,19 @@ def cogging_of(traces: Mapping[str, Trace], result: Evaluation) -> Cogging | Non
     if result.mechanics is None or not result.mechanics.harmonics.acceleration_rad_s2:
         return None
     harmonics = result.mechanics.harmonics
+    # small currents of a coasting with the voltage on damp what cogging makes of the speed
+    coasted = [trace for trace in traces.values() if trace.meta.get(POWERED)]
+    damped = max((coasting_torque(trace, torque) for trace in coasted), default=0.0) / J.value
+    shown = [replace(h, std=math.hypot(h.std, damped)) for h in harmonics.acceleration_rad_s2]
+    harmonics = replace(harmonics, acceleration_rad_s2=tuple(shown))
     how = f"coasting through {harmonics.turns:.3g} turns and more each way"
     return Cogging(harmonics, J, highest, math.inf, how)
+
+
+def coasting_torque(trace: Trace, torque: Torque) -> float:
+    """Return the standard deviation of the torque (N m) of a coasting's currents once those of the push are gone."""
+    later = slice(len(trace) // 4, None)
+    return float(np.std(torque(trace["i_d_a"][later], trace["i_q_a"][later])))
 
 
 def torque_orders(t_s: Array, theta: Array, torque_nm: Array, J_kgm2: float, highest: int) -> Complex:

@@ -152,7 +152,10 @@ def pushes_of(
     torque = torque_of(result, pole_pairs)
     found = result.inductance
     L_h = rough_L_h if found is None else (found.L_d.value, found.L_q.value)
-    doubt = SAMPLE_DOUBT if found is not None else 1.0
+    doubt = 1.0
+    if found is not None and result.resistance is not None:  # what a slope leaves of a current that fades in a period
+        faded = 0.5 * period_s * result.resistance.R_measured.value / min(L_h)
+        doubt = min(1.0, math.hypot(SAMPLE_DOUBT, faded))
     displaced, tilt, drag = 0.0, 0.0, 0.0
     for k, part in enumerate(parts):
         if not part.meta["coasting"] or part.meta.get(POWERED):

@@ -106,6 +106,11 @@ class MachineParameters:
         """Apparent q inductance where known, else the incremental one (H)."""
         return self.L_q_h if self.L_q_app_h is None else self.L_q_app_h
 
+    @property
+    def top_rpm(self) -> float | None:
+        """Largest speed (rpm); the rated one where only that is stated."""
+        return self.n_nom_rpm if self.n_max_rpm is None else self.n_max_rpm
+
     def torque_nm(self, i_d_a: float, i_q_a: float) -> float:
         """Torque of the linear machine (N m), 1.5 p (psi_d i_q - psi_q i_d)."""
         psi_d = self.psi_f_wb + self.L_d_decoupling_h * i_d_a

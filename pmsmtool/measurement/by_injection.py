@@ -100,11 +100,12 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
         The nameplate has no rated current or speed, and none was given.
     """
     machine = nameplate.machine
-    if machine.I_nom_apk is None or machine.n_max_rpm is None:
-        raise ConfigError("rated current and largest speed must be known", hint="give --i-max and --speed-max")
-    i_max = HEADROOM * machine.I_nom_apk if request.i_max_apk is None else request.i_max_apk
-    speed = rad_s_from_rpm(machine.n_max_rpm) if request.speed_max_rad_s is None else request.speed_max_rad_s
-    i_d_min = nameplate.limits.i_d_min_apk
+    rated, rpm, i_d_min = machine.I_nom_apk, machine.top_rpm, nameplate.limits.i_d_min_apk
+    i_max, speed = request.i_max_apk, request.speed_max_rad_s
+    if i_max is None:
+        i_max = HEADROOM * _stated(rated, "rated current", "I_nom_apk", "--i-max")
+    if speed is None:
+        speed = rad_s_from_rpm(_stated(rpm, "largest speed", "n_max_rpm", "--speed-max"))
     return Envelope(
         i_max_apk=i_max,
         speed_max_rad_s=speed,
@@ -114,8 +115,17 @@ def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
         brake=request.brake,
         acceleration_rad_s2=largest_acceleration(machine, i_max),
         voltage_speed_rad_s=voltage_speed(nameplate, i_max),
-        i_d_max_apk=machine.I_nom_apk if i_d_min is None else -i_d_min,
+        i_d_max_apk=(rated or i_max) if i_d_min is None else -i_d_min,
     )
+
+
+def _stated(rating: float | None, what: str, key: str, option: str) -> float:
+    if rating is None:
+        raise ConfigError(
+            f"the {what} is not known", where=f"[machine] {key}",
+            hint=f"put {key} into the machine file (data sheet), or give {option}",
+        )  # fmt: skip
+    return rating
 
 
 def with_limits_of(earlier: IdentifyRequest, request: IdentifyRequest, nameplate: MachineFile) -> IdentifyRequest:
@@ -166,7 +176,7 @@ def plan(task: Task) -> tuple[Envelope, list[str]]:
     envelope.refuse_gravity()
     steps = steps_of(request.measured, request.shaft == "locked")
     if "speeds" in steps:
-        require_speed(envelope.speed_max_rad_s, nameplate.machine.n_max_rpm or 0.0)
+        require_speed(envelope.speed_max_rad_s, nameplate.machine.top_rpm or 0.0)
     if "rotation" in steps:
         dwell_within(0.0, envelope.speed_max_rad_s)
     return envelope, plan_lines(envelope, request, nameplate)

@@ -226,7 +226,7 @@ def envelope_of(drive: CanopenDrive, request: IdentifyRequest, known: MachineFil
     rpm = (drive.parameters.held_value("motor.n_max_rpm") or UNLIMITED_RPM) if speed is None else speed[1]
     if known is not None:
         rated = min(rated, known.machine.I_nom_apk or math.inf)
-        rpm = min(rpm, known.machine.n_max_rpm or math.inf)
+        rpm = min(rpm, known.machine.top_rpm or math.inf)
     if request.speed_max_rad_s is None and rpm > NO_LIMIT_RPM:
         raise ConfigError(
             f"the drive's largest speed (0x6080) is {rpm:.0f} rpm: that is no limit", hint="give --speed-max"

@@ -60,6 +60,17 @@ def test_the_first_wrong_row_is_what_was_done(extra: str, wrong: str, tool: Tool
     assert ("input is open; the DC link has 540 V" in told) == ("safe_torque_off" in extra)
 
 
+@pytest.mark.chain
+def test_swapped_leads_come_before_pole_pairs_that_the_drive_alone_states(tool: Tool) -> None:
+    """Without MACHINE, a drive from the factory states 4 pole pairs of a machine of 3: its leads were named last."""
+    channel = f"{STATED}?leads_swapped=true&nv=:memory:"
+    code, out, told = tool("-i", "pmsmsim", "-c", channel, "check", "--yes", "--json")
+    wrong = [row["looked_at"] for row in json.loads(out)["findings"] if row["verdict"] == WRONG]
+    assert code == 1 and wrong == ["encoder sign", "pole pairs"]
+    first = told.index("not good: encoder sign: counts against the phase order")
+    assert first < told.index("wrong, too: pole pairs") < told.index("likely: two motor leads swapped")
+
+
 def test_the_file_of_another_motor_is_among_the_causes() -> None:
     """A 48 V motor's file at a drive of 540 V: `identify` named the amplitude alone, and `check` the supply."""
     assert "the file of another motor" in judge_supply(540.0, None, 48.0).likely

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from pathlib import Path
 
 import click
@@ -95,6 +96,15 @@ def test_output_and_motion_options() -> None:
     assert (motion.yes, motion.load, motion.brake, motion.shaft) == (True, "none", "none", None)
     _, out, motion = probe(["probe", "-q", "-v"])
     assert (out.json, out.verbosity, motion.yes) == (False, -1, False)
+
+
+@pytest.mark.parametrize("command", ["restore", "param set", "flash-params", "lss set-node"])
+def test_what_moves_nothing_lists_no_limits_of_motion(command: str, tool: Tool) -> None:
+    """They were listed though nothing moves; a line of a script that gives them is still taken."""
+    code, told, _ = tool(*command.split(), "--help")
+    assert code == 0 and "--serial" in told and not re.search("--i-max|--speed-max|--shaft", told)
+    limits = ("--i-max", "12Apk", "--speed-max", "60rpm", "--shaft", "free")
+    assert tool(*command.split(), *limits, "--help")[0] == 0
 
 
 def test_consent_is_not_taken_from_the_environment() -> None:

@@ -92,6 +92,22 @@ def test_a_current_limit_above_the_machines_own_says_what_is_used() -> None:
     assert unused_current(500.0, rated(None, None), pulses=True) == []
 
 
+def test_a_data_sheet_with_a_rated_speed_alone_sets_the_limit_and_an_option_stands_in_for_a_rating() -> None:
+    """`machine new --n-nom` wrote a file that `commission` refused, with and without the option that it named."""
+    own = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
+    sheet = replace(own, machine=replace(own.machine, n_nom_rpm=1500.0, n_max_rpm=None))
+    assert envelope_of(sheet, IdentifyRequest()).speed_max_rad_s == pytest.approx(50.0 * math.pi)
+    unrated = replace(own, machine=replace(own.machine, I_nom_apk=None, n_nom_rpm=None, n_max_rpm=None))
+    given = envelope_of(unrated, IdentifyRequest(i_max_apk=4.0, speed_max_rad_s=100.0))
+    assert (given.i_max_apk, given.speed_max_rad_s) == (4.0, 100.0)
+    with pytest.raises(ConfigError, match="rated current") as caught:
+        envelope_of(unrated, IdentifyRequest(speed_max_rad_s=100.0))
+    assert "I_nom_apk" in caught.value.hint and "--i-max" in caught.value.hint
+    with pytest.raises(ConfigError, match="largest speed") as caught:
+        envelope_of(unrated, IdentifyRequest(i_max_apk=4.0))
+    assert "n_max_rpm" in caught.value.hint and "--speed-max" in caught.value.hint
+
+
 @pytest.mark.parametrize("rpm", [26.0, 60.0, 200.0, 3000.0])
 def test_the_slow_turn_keeps_to_the_speed_limit_even_with_one_pole_pair(rpm: float) -> None:
     mean_rpm = STEP_RAD / dwell_within(0.015, rpm * math.pi / 30.0) * 30.0 / math.pi

@@ -36,20 +36,18 @@ from pmsmtool.trace import Trace
 RECORDS_LEAST = 3
 """Records below which a line's noise is not known."""
 STOPPED_S = 0.02
-"""Time over which a speed is looked at for a change of its sign: there friction is no constant any more. The records
-of a shaft that had come to rest gave J 3.1 to 3.9 % too large."""
+"""Time over which a speed is looked at for a change of its sign: friction is no constant there (J 3.9 % too large)."""
 COHERENT = 0.5
 """Coherence from which a line belongs to the band that the data support."""
 COHERENT_LEAST = 8
-"""Coherent lines below which no response is given: a heavy load shows at its resonance only (29 lines on two drives
-with a load of 11 and 12 times the motor's inertia)."""
+"""Coherent lines below which no response is given: a heavy load shows at its resonance only (29 of a load of 11 J)."""
 INFORMATION_GAIN = 10.0
 """Smallest difference of the information criterion: very strong evidence (Kass and Raftery 1995)."""
 ZETA_MOST = 0.5
 """Damping from which a pair of poles is no resonance."""
 RESONANCE_STD, ANTIRESONANCE_STD = 0.03, 0.1
 """Largest relative standard deviations of a resonance and an antiresonance that are claimed: those of a heavy load have
-few lines (measured: 493.9 +- 0.66 of 494 Hz, 130 +- 5.5 of 137 Hz), and a controller that knows neither shakes it."""
+few lines (130 +- 5.5 of 137 Hz), and a controller that knows neither shakes it."""
 APART, APART_STDS = 0.02, 4.0
 """Least distance of resonance and antiresonance: closer, a second mass would be a twenty-fifth of the first; and in
 their standard deviations (12.8 and 12.4 Hz of a rigid shaft with cogging were 2.5 apart, and claimed)."""
@@ -64,8 +62,7 @@ LN_LARGEST = 20.0
 SHOWN_RATIO, SHOWN_ZETA, SHOWN_TRIED = 0.2, 0.01, 60
 """Load over motor and damping of the resonance whose largest visible frequency is told where none is found; tries."""
 ZETA_FLOOR = 0.01
-"""Relative deviation of the damping beyond the fit's: rows do not show the current between them. Measured on one
-simulated drive: 0.014 too much, 0.005 by the fit."""
+"""Relative deviation of the damping beyond the fit's: rows do not show the current between them (0.014 once)."""
 INERTIA_FLOOR = 1e-3
 """Relative deviation of the inertia beyond the fit's and the torque's (tests/measurement/test_frequency_response)."""
 INERTIA_FALLBACK = "from the frequency response alone: friction is not known, and a load behind a play is not seen"
@@ -147,7 +144,8 @@ def estimate_frequency_response(
     direction: int = 1,
     scale_std: float = 0.0,
     noise_nm: float = 0.0,
-    over_angle: Callable[[Array], Array] | None = None,
+    over_angle: Callable[[Array], Array] = np.zeros_like,
+    angle_std: float = 0.0,
     tolerance: SensorTolerance | None = None,
 ) -> FrequencyResponse:
     """Estimate the response, the inertia, and the resonance where there is one.
@@ -164,8 +162,8 @@ def estimate_frequency_response(
         Relative standard deviation of the torque's scale, which goes into the inertia one to one.
     noise_nm : float
         Standard deviation of the torque's samples by the noise of the measured currents (N m).
-    over_angle : callable, optional
-        Cogging (N m) of an array of angles along the phase order: it moves the shaft, too.
+    over_angle, angle_std : callable, float
+        Cogging (N m) of an array of angles along the phase order: it moves the shaft, too; its relative deviation.
     tolerance : SensorTolerance
         Declared sensor tolerances.
 
@@ -183,27 +181,26 @@ def estimate_frequency_response(
     flagged = sum(int(np.sum(run["flagged"] > 0.0)) for run in runs)
     if flagged:
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
-    torques = [torque(run["i_d_a"], run["i_q_a"]) for run in runs]
-    if over_angle is not None:
-        torques = [tau + over_angle(direction * run["theta_M_rad"]) for tau, run in zip(torques, runs, strict=True)]
-    omega, U, Y, T = transforms(runs, torques, direction)
-    U = without_noise(U, (len(runs[0]) - 2) * noise_nm**2)
+    omega, of_currents, Y, T = transforms(runs, [torque(run["i_d_a"], run["i_q_a"]) for run in runs], direction)
+    _, cogging, *_ = transforms(runs, [over_angle(direction * run["theta_M_rad"]) for run in runs], direction)
+    U = without_noise(of_currents + cogging, (len(runs[0]) - 2) * noise_nm**2)
     omega, Y = omega[: U.shape[1]], Y[:, : U.shape[1]]
+    unsure = angle_std * np.sqrt(np.mean(np.abs(cogging[:, : U.shape[1]]) ** 2, axis=0))
     scale = (scale_std, tolerance or SensorTolerance())
-    result, lines, rigid = _judged(omega, U, Y, T, scale)
+    result, lines, rigid = _judged(omega, U, Y, T, unsure, scale)
     if result.information_gain > INFORMATION_GAIN and not result.found:
         ripple = _ripple(lines, rigid, runs, direction, U.shape[1])
         if ripple is not None:
-            steady, _, _ = _judged(omega, U + ripple, Y, T, scale)
+            steady, _, _ = _judged(omega, U + ripple, Y, T, unsure, scale)
             return steady if steady.information_gain <= INFORMATION_GAIN else result
     return result
 
 
 def _judged(
-    omega: Array, U: Complex, Y: Complex, T: float, scale: tuple[float, SensorTolerance]
+    omega: Array, U: Complex, Y: Complex, T: float, unsure: Array, scale: tuple[float, SensorTolerance]
 ) -> tuple[FrequencyResponse, _Lines, Fit]:
     """Return what transforms of torque and acceleration say, their inner lines, and the fit of one mass."""
-    lines, G, std, coherence, rigid = _rigid_shaft(omega, U, Y, T)
+    lines, G, std, coherence, rigid = _rigid_shaft(omega, U, Y, T, unsure)
     frequency = lines.omega / (2.0 * math.pi)
     highest = float(frequency[coherence >= COHERENT][-1])
     chi2_rigid = rigid.cost / rigid.dof
@@ -233,10 +230,13 @@ def _judged(
     return FrequencyResponse(*facts, chi2, gain, estimates, reason, both), lines, rigid
 
 
-def _rigid_shaft(omega: Array, U: Complex, Y: Complex, T: float) -> tuple[_Lines, Complex, Array, Array, Fit]:
-    """Return the inner lines, response, its deviation and coherence there, and the fit of one mass."""
+def _rigid_shaft(
+    omega: Array, U: Complex, Y: Complex, T: float, unsure: Array
+) -> tuple[_Lines, Complex, Array, Array, Fit]:
+    """Return inner lines, response, its deviation and coherence, and the fit of one mass; ``unsure``: of the torque."""
     G, sigma, std, coherence = local_polynomials(U, Y)
     inner = slice(HALF_WIDTH, len(omega) - HALF_WIDTH)
+    sigma = np.hypot(sigma, unsure[inner] * np.abs(G))  # what all records share is not in their noise
     lines = _Lines(omega[inner], np.exp(-1j * omega[inner] * T), T, U[:, inner], Y[:, inner], sigma)
     coherent = coherence >= COHERENT
     if (count := int(np.sum(coherent))) < COHERENT_LEAST:
@@ -252,7 +252,7 @@ def _rigid_shaft(omega: Array, U: Complex, Y: Complex, T: float) -> tuple[_Lines
 def _ripple(lines: _Lines, rigid: Fit, runs: Sequence[Trace], direction: int, count: int) -> Complex | None:
     """Return the transforms of a torque over the angle of the shaft that one mass leaves unexplained; None without.
 
-    Its orders are taken one after the other, while each gains what the information criterion asks of a second mass.
+    Orders are taken one by one, while each gains what the information criterion asks of a second mass.
     """
     G, basis = _rigid(lines, rigid.x)
     Q, _ = np.linalg.qr(_stacked(basis.T, lines.sigma).T)

@@ -5,11 +5,10 @@ With i_d = 0 the torque is 1.5 p psi i_q. Divided by J and integrated over a pus
 
     w(t) = (1.5 p psi / J) int i_q dt - (tau_c / J) int sgn(w) dt - (B / J) int w dt + w_0
 
-One linear regression over all pushes, each with its own w_0, gives 1.5 p psi/J and tau_c/J, hence J/psi and tau_c/psi.
+One linear regression over all pushes, each way with its own w_0, gives 1.5 p psi/J and tau_c/J: J/psi and tau_c/psi.
 A drive that does not decouple its current loops lets a d current flow, and (L_d - L_q) i_d i_q adds to the torque. i_d
 is measured, or it is a high pass of omega i_q: what a PI of d without feed-forward leaves of the voltage omega L_q i_q,
-when its zero lies on the pole of the winding. One more coefficient takes it up, unless that changes J/psi by less
-than it is known to then.
+when its zero lies on the pole of the winding. One more coefficient takes it up where that surely changes J/psi.
 The speed is the slope of the counted position over a block. The spread is a jackknife over the pushes.
 """
 
@@ -18,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 from typing import TypeVar
 
 import numpy as np
@@ -45,7 +45,7 @@ LAGS_S = tuple(0.005 * 2.0 ** (0.5 * k) for k in range(11))
 """Time constants (s) of the high pass; one below them gives the slope of omega i_q, as the first one nearly does."""
 SATURATED_SHARE = 0.15
 """Of what the d current's torque changes in J/psi, what is left open: saturation changes L_d - L_q; seen: 0.13."""
-SURELY = 2.0
+SURELY = 3.0
 """Standard deviations by which that torque changes J/psi where it is taken up; less is noise."""
 SMOOTH = 5
 """Degree of the polynomial that a current under one command follows."""
@@ -78,23 +78,27 @@ def estimate_ratios(
         ``E_EXCITATION``, ``E_NOT_IDENTIFIABLE``.
     """
     tolerance = tolerance or SensorTolerance()
-    parts = [part for part in (_part(push, LAGS_S[0]) for push in pushes) if part is not None]
-    n = len(parts)
+
+    def parts_at(lag: float, *, whole: bool = False) -> list[Part]:
+        return [part for push in pushes if (part := _part(push, lag, whole)) is not None]
+
+    n = len(parts := parts_at(LAGS_S[0]))
     if n < LEAST_PUSHES:
         raise refuse("E_EXCITATION", f"{n} usable torque pulses, {LEAST_PUSHES} needed", stage=STAGE)
-    sense = math.copysign(1.0, sum(float(p[0][-1] - p[0][0]) * float(p[1][-1]) for p in parts))
+    sense = math.copysign(1.0, sum(float(p[0] @ p[1]) for p in parts))
     (full, std), left_open = _with_spread(parts, sense, pole_pairs, 3), 0.0
+    measured = any("i_d_a" in push.signals for push in pushes)
     with contextlib.suppress(IdentificationError):  # a d current that is zero, or follows the current as speed does
-        lags = LAGS_S[1:] if all("i_d_a" not in push.signals for push in pushes) else ()
-        others = [[part for part in (_part(push, lag) for push in pushes) if part is not None] for lag in lags]
-        best = min((parts, *others), key=lambda tried: _fit(tried, sense, 4)[1])
-        salient, its_std = _with_spread(best, sense, pole_pairs, 4)
-        if max(std[0], abs(full[0] - salient[0]) / SURELY) > its_std[0]:
-            left_open = SATURATED_SHARE * abs(full[0] - salient[0])
-            full, std = salient, its_std
-    weakest = min(abs(float(p[1][-1]) / float(p[-1][-1])) for p in parts)
+        lag = min(LAGS_S[: 1 if measured else None], key=lambda lag: _fit(parts_at(lag), sense, 4)[1])
+        salient, its_std = _with_spread(parts_at(lag), sense, pole_pairs, 4)
+        seen = max(std[0], abs(full[0] - salient[0]) / SURELY) > its_std[0]
+        if seen and (measured or salient[0] < full[0]):  # what no loop decouples brakes where L_q > L_d
+            salient, std = _with_spread(parts_at(lag, whole=True), sense, pole_pairs, 4)
+            left_open, full = SATURATED_SHARE * abs(full[0] - salient[0]), salient
+    weakest = min(abs(float(p[1] @ p[-1] / (p[-1] @ p[-1]))) for p in parts)
+    excess = 0.0 if measured else _amplitude_excess(pushes)
     floors = (
-        math.hypot(full[0] * math.hypot(tolerance.current_gain, MODEL_FLOOR, _amplitude_excess(pushes)), left_open),
+        math.hypot(full[0] * math.hypot(tolerance.current_gain, MODEL_FLOOR, excess), left_open),
         math.hypot(full[1] * tolerance.current_gain, FRICTION_FLOOR * torque_per_ampere(pole_pairs, weakest)),
     )
     rows = sum(len(p[0]) for p in parts)
@@ -102,8 +106,7 @@ def estimate_ratios(
         name: Estimate(float(full[k]), float(std[k]), float(floors[k]), unit, n=rows, method=METHOD, dof=n - 1.0)
         for k, (name, unit) in enumerate((("J_per_psi", "kg m2/Wb"), ("tau_c_per_psi", "N m/Wb")))
     }
-    half = statistical_half_width(found["J_per_psi"])
-    if not full[0] > 0.0 or half > RATIO_LIMIT * full[0]:
+    if not (half := statistical_half_width(found["J_per_psi"])) <= RATIO_LIMIT * full[0]:
         raise refuse(
             "E_NOT_IDENTIFIABLE",
             f"J/psi is {full[0]:.3g} +-{half:.2g} kg m2/Wb between the torque pulses, limit {100.0 * RATIO_LIMIT:g} %",
@@ -120,23 +123,23 @@ def _amplitude_excess(pushes: Sequence[Trace]) -> float:
     """
     shares = []
     for push in pushes:
-        if "i_d_a" in push.signals:
-            return 0.0
         t, i = (np.asarray(values)[round(SKIP_SHARE * len(push)) :] for values in (push.t_s, push["i_q_a"]))
         rest = i - np.polyval(np.polyfit(t - t.mean(), i, SMOOTH), t - t.mean())
         shares.append(float(np.mean(rest**2) / np.mean(i**2)))
     return float(np.mean(shares))
 
 
-def _part(push: Trace, lag_s: float) -> Part | None:
-    """Return speed, integrals of current, sign of speed, speed and i_d i_q, and time, at the blocks of a push."""
+def _part(push: Trace, lag_s: float, whole: bool) -> Part | None:
+    """Return speed, integrals of current, sign of speed, speed and i_d i_q, and time, at the blocks of a push.
+
+    But for a ``whole`` push each way has its own w_0: what friction does where the shaft turns back is not seen.
+    """
     skip = round(SKIP_SHARE * len(push))
     size = (len(push) - skip) // BLOCKS
     if size < 1:
         return None
     t, theta, i = (np.asarray(values, dtype=np.float64) for values in (push.t_s, push["theta_M_rad"], push["i_q_a"]))
-    edges = skip + np.arange(BLOCKS + 1) * size
-    edges[-1] = min(edges[-1], len(t) - 1)
+    edges = np.minimum(skip + np.arange(BLOCKS + 1) * size, len(t) - 1)
     spans = np.diff(t[edges])
     if np.any(spans <= 0.0):
         return None
@@ -153,7 +156,9 @@ def _part(push: Trace, lag_s: float) -> Part | None:
     moving = np.abs(w) >= STILL * np.abs(w).max()
     if moving.sum() < BLOCKS // 2:
         return None
-    return tuple(x[moving] for x in (w, charge, signs, way, reluctance, middle - t[skip]))
+    rows = np.array((w, charge, signs, way, reluctance, middle))[:, moving]
+    ways = [rows] if whole else np.split(rows, 1 + np.flatnonzero(np.diff(sign[moving])), axis=1)
+    return tuple(np.hstack([one - one.mean(axis=1, keepdims=True) for one in ways]))
 
 
 def _left_of_slope(t: Array, theta: Array, i: Array, size: int, lag_s: float) -> Array:
@@ -161,10 +166,8 @@ def _left_of_slope(t: Array, theta: Array, i: Array, size: int, lag_s: float) ->
     k = np.arange(len(t))
     before, after = np.maximum(k - size // 2 - 1, 0), np.minimum(k + size // 2 + 1, len(t) - 1)
     product = (theta[after] - theta[before]) / (t[after] - t[before]) * i
-    left = [0.0]
-    for kept, step in zip(np.exp(-np.diff(t) / lag_s), np.diff(product), strict=True):
-        left.append(float(kept * (left[-1] + step)))
-    return np.array(left)
+    steps = zip(np.exp(-np.diff(t) / lag_s), np.diff(product), strict=True)
+    return np.array(list(accumulate(steps, lambda left, new: new[0] * (left + new[1]), initial=0.0)))
 
 
 def _with_spread(parts: Sequence[Part], sense: float, pole_pairs: int, columns: int) -> tuple[Array, Array]:
@@ -172,18 +175,15 @@ def _with_spread(parts: Sequence[Part], sense: float, pole_pairs: int, columns: 
 
     def ratios(kept: Sequence[Part]) -> Array:
         rise, slowing = _fit(kept, sense, columns)[0][:2]
-        if rise == 0.0:
-            raise refuse("E_EXCITATION", "the shaft does not answer the current", stage=STAGE)
         return np.array([1.0, -slowing]) * (torque_per_ampere(pole_pairs, 1.0) / float(rise))
 
     return ratios(parts), np.sqrt(jackknife_variance(ratios, parts))
 
 
 def _fit(parts: Sequence[Part], sense: float, columns: int) -> tuple[Array, float]:
-    """Return coefficients and squared residual; the constants of the pushes are projected out."""
-    centred = [np.concatenate([part[k] - part[k].mean() for part in parts]) for k in range(1 + columns)]
-    w, signed = centred[0], [sense * centred[1], *centred[2:]]
-    found = regress(signed, w, what="current and friction", stage=STAGE)
+    """Return coefficients and squared residual."""
+    w, charge, *others = np.hstack([part[: 1 + columns] for part in parts])
+    found = regress(signed := [sense * charge, *others], w, what="current and friction", stage=STAGE)
     return found, float(np.sum((w - np.column_stack(signed) @ found) ** 2))
 
 

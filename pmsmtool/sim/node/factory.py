@@ -37,7 +37,7 @@ def factory_values(machine_file: MachineFile) -> dict[str, float]:
     machine, inverter, limits = machine_file.machine, machine_file.inverter, machine_file.limits
     i_max = machine.I_max_apk or machine.I_nom_apk or BY_NAME["motor.I_max_apk"].default
     i_nom = machine.I_nom_apk or i_max / 2.0
-    n_max = machine.n_max_rpm or BY_NAME["motor.n_max_rpm"].default
+    n_max = machine.top_rpm or BY_NAME["motor.n_max_rpm"].default
     gain = GAIN_SHARE * inverter.V_max_v / i_max
     values = {
         "motor.I_max_apk": i_max,
