@@ -163,8 +163,9 @@ def _identified(
 ) -> dict[str, Estimate]:
     """Find inertia and friction, write the machine file, and return both."""
     from pmsmtool.commissioning.compared_stage import refuse_inertia
+    from pmsmtool.commissioning.contradiction import flux_doubt
     from pmsmtool.files import write_file
-    from pmsmtool.identification.completed_machine import completed_machine
+    from pmsmtool.identification.completed_machine import PER_PSI, completed_machine
     from pmsmtool.identification.move_mechanics import move_mechanics
     from pmsmtool.machine.machine_file import dump_machine_file
 
@@ -172,14 +173,16 @@ def _identified(
         trace, pole_pairs=source.machine.pole_pairs, undecided=drive.current_undecided, rated_apk=drive.rated_apk
     )
     refuse_inertia(source, ratios["J_per_psi"], run)
-    made = completed_machine(source, ratios, "as given").machine
+    made = completed_machine(source, ratios, "as given", flux_doubt(source)).machine
     assert made is not None
+    if "tau_c_per_psi" not in ratios:
+        out.warn("tau_c_nm not identified: these moves show no friction above zero; longer ones (--by) may")
     text = dump_machine_file(made)
     run.save("machine.toml", text)
     if path is not None:
         write_file(path, text)
         out.note(f"wrote {path}")
-    return {name: made.estimates[name] for name in ("J_kgm2", "tau_c_nm") if name in made.estimates}
+    return {name: made.estimates[name] for ratio, name in PER_PSI.items() if ratio in ratios}
 
 
 def _told(found: dict[str, Estimate]) -> list[str]:

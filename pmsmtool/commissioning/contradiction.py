@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from pmsmtool.estimators.resistance import R_MEASURED
+from pmsmtool.identification.completed_machine import UNKNOWN_TEMPERATURE_K
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.machine_keys import MEASURABLE
 from pmsmtool.machine.temperature import UNKNOWN_T_RANGE_C
@@ -395,6 +396,11 @@ def _devices_least_ohm(file: MachineFile) -> float:
     """Return the resistance that devices and cable may have at least behind this motor (ohm)."""
     I_nom = file.machine.I_nom_apk
     return max(DEVICES_LEAST_OHM, DEVICES_LEAST_V / I_nom if I_nom else 0.0)
+
+
+def flux_doubt(file: MachineFile) -> float:
+    """Return the share (95 %) by which the flux linkage as stated may be wrong, at a temperature that nothing tells."""
+    return math.hypot(_share("psi_f_wb", file)[0], file.machine.alpha_psi_per_k * UNKNOWN_TEMPERATURE_K)
 
 
 def _share(name: str, file: MachineFile) -> tuple[float, str]:

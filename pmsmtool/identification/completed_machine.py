@@ -57,7 +57,9 @@ class CompletedMachine:
         ]
 
 
-def completed_machine(known: MachineFile | None, found: Mapping[str, Estimate], source: str) -> CompletedMachine:
+def completed_machine(
+    known: MachineFile | None, found: Mapping[str, Estimate], source: str, flux_doubt: float = 0.0
+) -> CompletedMachine:
     """Put measured values into a machine that is known otherwise.
 
     Parameters
@@ -68,6 +70,9 @@ def completed_machine(known: MachineFile | None, found: Mapping[str, Estimate], 
         Measured: keys of a machine file, ``direction``, ``frame_offset_rad`` and the ratios of :data:`PER_PSI`.
     source : str
         Where ``known`` comes from.
+    flux_doubt : float
+        Share (95 %) by which the flux linkage as given may be wrong, where J and tau_c are to stand without it. 0: what
+        is designed takes the same flux linkage, so that their ratio to it is what counts.
     """
     if known is None:
         return CompletedMachine(None, ())
@@ -75,7 +80,9 @@ def completed_machine(known: MachineFile | None, found: Mapping[str, Estimate], 
     psi = _flux_of_the_run(known, values.get("psi_f_wb"))
     for ratio, key in PER_PSI.items():
         if ratio in found:
-            values[key] = _times(found[ratio], psi, values.get("psi_f_wb"), MEASURABLE[key].unit)
+            measured_psi = values.get("psi_f_wb")
+            doubt = psi * flux_doubt if measured_psi is None else total_half_width(measured_psi)
+            values[key] = _times(found[ratio], psi, doubt, MEASURABLE[key].unit)
     fields = {name for name in values if hasattr(known.machine, name)}
     table = {name: values[name].value for name in fields}
     if "pole_pairs" in table:
@@ -126,11 +133,11 @@ def _flux_of_the_run(known: MachineFile, measured: Estimate | None) -> float:
     return magnet_flux_at(replace(known.machine, psi_f_wb=measured.value), measured.T_c)
 
 
-def _times(ratio: Estimate, psi: float, of: Estimate | None, unit: str) -> Estimate:
-    doubt = 0.0 if of is None else ratio.value * total_half_width(of)
+def _times(ratio: Estimate, psi: float, doubt: float, unit: str) -> Estimate:
     return replace(
-        ratio, value=ratio.value * psi, std=ratio.std * psi, systematic=math.hypot(ratio.systematic * psi, doubt),
-        unit=unit, method=f"{ratio.method}, times the flux linkage",
+        ratio, value=ratio.value * psi, std=ratio.std * psi, unit=unit,
+        systematic=math.hypot(ratio.systematic * psi, ratio.value * doubt),
+        method=f"{ratio.method}, times the flux linkage",
     )  # fmt: skip
 
 

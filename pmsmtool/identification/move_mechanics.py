@@ -35,7 +35,7 @@ LEAST_SAMPLES = 60
 
 
 def move_mechanics(trace: Trace, *, pole_pairs: int, undecided: bool, rated_apk: float = 0.0) -> dict[str, Estimate]:
-    """Return ``J_per_psi`` (kg m2/Wb) and ``tau_c_per_psi`` (N m/Wb) of recorded moves.
+    """Return ``J_per_psi`` (kg m2/Wb) of recorded moves, and ``tau_c_per_psi`` (N m/Wb) where it is above zero.
 
     Parameters
     ----------
@@ -60,6 +60,8 @@ def move_mechanics(trace: Trace, *, pole_pairs: int, undecided: bool, rated_apk:
     found = _with_offset(found, halves, pole_pairs, OFFSET_SHARE * rated_apk)
     if undecided:
         found = {name: either_reading(estimate) for name, estimate in found.items()}
+    if found["tau_c_per_psi"].value <= 0.0:  # cogging within the way, or a lag of the current, hides it
+        del found["tau_c_per_psi"]
     return {name: replace(estimate, method=METHOD) for name, estimate in found.items()}
 
 

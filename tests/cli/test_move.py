@@ -191,7 +191,8 @@ def test_a_drive_of_position_modes_alone_gives_its_inertia(tool: Tool, tmp_path:
     code, printed, said = tool("move", *asked, "--map", "own.toml", "--sim", channel, "--yes", "--json")
     assert code == 0, said
     inertia = json.loads(printed)["identified"]["J_kgm2"]
-    assert abs(inertia["value"] - J) < inertia["systematic"] + 2.0 * inertia["std"] < 0.05 * J
+    assert inertia["value"] == pytest.approx(J, rel=0.03)
+    assert abs(inertia["value"] - J) < inertia["systematic"] + 2.0 * inertia["std"] < 0.15 * J, "psi as stated: 12 %"
 
 
 def first_move(trace: Trace) -> tuple[Array, Array]:
