@@ -172,6 +172,8 @@ ERROR_CAUSES: dict[int, str] = {
     0x3210: "the shaft was braked and nothing takes its energy: no chopper, or a supply that cannot sink",
     0x3220: "the supply is off, too weak, or in current limit: raise its limit, or go on with a lower --i-max",
     0x4310: "the winding is still warm from what ran before: let it cool, then go on",
+    0x8611: "a blocked shaft or a closed brake, an encoder that counts the other way (`pmsmtool check`), too small a "
+    "current limit for the move, or a narrow window (0x6065)",
 }
 """Likely cause of some of them."""
 

@@ -12,6 +12,7 @@ from pmsmtool.commissioning.export import image_of
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
+from pmsmtool.drive_maps.shipped_maps import family_names
 from pmsmtool.firmware.image import crc32
 from pmsmtool.flash.download import Download, set_named
 from pmsmtool.flash.journal import JournalFolder
@@ -72,8 +73,9 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
 
 
 def _map_option(drive_map: DriveMap) -> str:
-    """Return the option that names the map of a drive which is not the reference drive."""
-    return "" if drive_map.name == reference_map().name else f" --map {drive_map.name}"
+    """Return the option that names the map of a drive which is not the reference drive; FILE for a person's own."""
+    name = drive_map.name if drive_map.name in family_names() else "FILE"
+    return "" if drive_map.name == reference_map().name else f" --map {name}"
 
 
 def _held_already(plan: Plan, firmware: Sequence[str]) -> Stage:

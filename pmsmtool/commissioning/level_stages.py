@@ -47,6 +47,7 @@ RECORDER_STEPS = ("speed_step",)
 """Experiments of a proof that need no excitation: a speed reference while the drive records."""
 PREDICTED = ("speed.K_p_nms_per_rad", "speed.filter_hz")
 """What a predicted speed step stands on besides the gains of the current loops."""
+NO_STEPS = "the drive's responses cannot be recorded: needs set-points for d and q, and a recorder at loop rate"
 NOT_SHOWN = (
     "; the guarantee of its limits bounds a voltage that it does not record (on a simulated node: `pmsmtool reproduce "
     "closed-drive`)"
@@ -292,6 +293,7 @@ class LevelStages:
         if not lacking_gains(cells)[CURRENT_LOOPS]:
             lacking = ", ".join(name for name in PREDICTED if name not in cells)
             reason = f"the response of its speed loop cannot be predicted: the map has no object for {lacking}"
+            reason = reason if lacking else NO_STEPS
         design = self.run.path / "design.toml"
         return reason + (NOT_SHOWN if design.is_file() and guaranteed(load_design(design)) else "")
 

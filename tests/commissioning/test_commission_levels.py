@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -18,6 +20,7 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
 from pmsmtool.commissioning.closed_stage import LIMITS, NO_BANDWIDTH, NO_INERTIA, why_no_limits
 from pmsmtool.commissioning.commission import Commissioning, begin_run, due_stages
+from pmsmtool.commissioning.level_stages import NO_STEPS, LevelStages
 from pmsmtool.commissioning.rated_limits import NAMES
 from pmsmtool.commissioning.report_page import NO_DATA_SHEET, report_page, verdict
 from pmsmtool.design.closed_drive import RATED, SLOPE, SPEED, TORQUE
@@ -26,7 +29,7 @@ from pmsmtool.design.loops.open_loops import lacking_gains
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, Contradiction, ExitCode, NotAvailable
 from pmsmtool.identification.replay import replay
@@ -392,3 +395,10 @@ def test_a_measurement_that_is_not_accepted_says_what_to_change(
     (run,) = Path("runs").iterdir()
     assert verdict(run).word == "FAIL"
     assert "--resume" not in outcome.stderr and "begin a new run" in outcome.stderr
+
+
+def test_a_map_with_every_gain_says_what_a_proof_lacks_besides(tmp_path: Path) -> None:
+    """It ended "the map has no object for" and named none."""
+    found = SimpleNamespace(drive_map=replace(reference_map(), staging=False))
+    stages: Any = SimpleNamespace(found=found, run=SimpleNamespace(path=tmp_path))
+    assert LevelStages._no_proof(stages) == NO_STEPS

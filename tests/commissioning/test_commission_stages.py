@@ -377,3 +377,4 @@ def test_differences_that_follow_from_unchecked_values_say_so(tmp_path: Path, dr
     assert "current.K_p_d_v_per_a" not in marked
     assert person.shown[0][-1] == "undo      `pmsmtool restore` brings the old values back"
     assert _map_option(load_family("epos4")) == " --map epos4"
+    assert _map_option(replace(load_family("epos4"), name="mine")) == " --map FILE", "no shipped family"
