@@ -123,6 +123,7 @@ def move_command(
             f"the shaft moves by {math.degrees(way_rad):.4g} deg and back with the drive's own position loop, {times} "
             f"time{'s' if times > 1 else ''}",
             f"voltage off where the shaft is {math.degrees(drive.error_limit_rad):.3g} deg behind and comes no nearer",
+            "before that it turns by a degree with little current, to see that it does not run away",
             *([] if find is None else ["its profile is found first by slower moves within this way"]),
             *(f"changed for the move: {name} {value:.5g} {_unit(name)}" for name, value in lent.items()),
             "nothing is stored in the drive; every changed object is restored",
