@@ -49,29 +49,27 @@ BLOCKS = 250
 """Positions of a trace in the fit; the currents between two are averaged."""
 TRACES_LEAST = 4
 """A push and a coasting in each direction."""
+MOVING_LEAST = 16  # blocks at the begin of a trace from which a fit starts, however soon the shaft rests
 REST_SHARE = 0.005
 """Way of the shaft, of a trace's whole, from which on it is fitted."""
 STEP_SHARE = 0.1
 """Part of a push within which its step may be limited."""
 COARSE_RIPPLES = (0.3, 0.03, 3e-3, 3e-4)
 """Least noise of the torque in the first fits, of the push's, one after the other: with an encoder's resolution alone
-the cost is a narrow, bent valley in which a fit from rough starting values, or straight from the first of these, does
-not arrive (1 of 160 realisations, and 1 of 33 random drives)."""
+the cost is a narrow, bent valley in which a fit from rough starting values does not arrive (1 of 160 realisations)."""
 FITS_MOST = 10
 """Fits after it; the second whitens with the inertia of the first, more only where the torque's noise grows."""
 PATIENT_FITS = 2
 """Fits after which the noise grows before a minimum, too: a shaft that the model is far from has none."""
 TORQUE_FLOOR = 1e-3
 """Deviation of a block's torque beyond the noise of the currents, of the push's: ripple that samples do not show."""
-COASTING_FLOOR = 1e-4
-"""The same of a coasting, from where it grows."""
+COASTING_FLOOR = 1e-4  # the same of a coasting, from where it grows
 GROWTH_MOST = 2.5
 """Largest growth of the torque's noise from one fit to the next: a fit that has not arrived asks for too much."""
 COGGING_FITS = 2
 """Fits where there is cogging: its torque takes the inertia of the one before."""
 SEPARABLE = 0.5e7
-"""Largest condition number: a covariance is good to 1e7. Up to it a friction that is known badly says so by its own
-interval, and J is kept: at 1.1e6 all three were lost."""
+"""Largest condition number: a covariance is good to 1e7; below, a friction that is known badly leaves J as it is."""
 RIPPLE_MOST = 0.15
 """Largest deviation of a block's torque, of the push's: above, the shaft is not what the model says."""
 UNEXPLAINED = 2.0
@@ -80,11 +78,11 @@ DRAG_PENALTY = 9.0
 """Price of the drag in the information criterion: it is there from three standard deviations on. With 16 one of 3.1 was
 left out, and B was 26 % off with an interval of 5 %; a shaft without drag has the same total intervals with both."""
 NOTED = 0.01
-"""Deviation of a block's torque, of the push's, from which on a reader is told why the intervals are wide: the healthy
-default machine has 0.0035 to 0.0039 (`identify all`), which leaves J at 0.07 % where its tolerance is 1.4 %."""
+"""Deviation of a block's torque, of the push's, from which on a reader is told why the intervals are wide; the default
+machine has 0.0035 to 0.0039."""
 NOISY_TORQUE = "cogging, a load or a gear on the shaft, an elastic coupling, an encoder that is off centre"
 SCALE_FLOOR = 3e-4
-"""Relative deviation of the torque's scale beyond that of the flux linkage and of the samples' displacement."""
+"""Relative deviation of the torque's scale beyond that of flux linkage and displaced samples."""
 NO_HARMONICS = AngleHarmonics()
 MEAN_STD = 0.04
 """Relative standard deviation of the inertia by mean accelerations: six shafts with play were 0.1 to 1.6 % off."""
@@ -273,7 +271,7 @@ def mean_mechanics(
     Whatever swings or strikes within half a trace is in neither mean. Parameters as of :func:`estimate_mechanics`;
     nothing where it finds no inertia, and no friction that may be more than what turned the shaft.
     """
-    runs = [_fast(_fast(_window(run))) for run in runs]  # the second time without a long rest
+    runs = [_fast(_window(run)) for run in runs]
     step = encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, 0.0, 0.0, direction, step, NO_HARMONICS, 0.0)[1] for run in runs]
     values, stds, _ = _mean_motion(blocks, power=1.0)
@@ -395,13 +393,15 @@ def _start(runs: Sequence[Run]) -> Array:
 def _mean_motion(runs: Sequence[Run], power: float = 0.0) -> tuple[Array, list[float], list[float]]:
     """Return J, B, tau_c of the mean torques and motions of half traces, their deviations, and the first states.
 
-    With a ``power`` of 1 errors are a share of the acceleration: pushes tell J, coasting friction; no half is at rest.
+    With a ``power`` of 1 errors are a share of the acceleration: pushes tell J, coasting friction.
     """
     rows, torques, states = [], [], []
     for run in runs:
-        t = run.T * np.arange(len(run.theta))
+        way = np.abs(np.diff(run.theta))
+        moving = max(MOVING_LEAST, int(np.nonzero(way > LEAST_SPEED * np.max(way))[0][-1]) + 1)  # a rest tells nothing
+        t = run.T * np.arange(moving)
         # a parabola follows a push or a coasting closely enough for a start; halves of it tell the friction's slope
-        for part in (slice(0, len(t) // 2), slice(len(t) // 2, None)):
+        for part in (slice(0, moving // 2), slice(moving // 2, moving)):
             a, b, _ = np.polyfit(t[part], run.theta[part], 2)
             omega = b + 2.0 * a * float(np.mean(t[part]))
             rows.append([2.0 * a, omega, math.copysign(1.0, omega)])
