@@ -30,6 +30,7 @@ from pmsmtool.identification.replay import replay
 from pmsmtool.identification.run_files import MACHINE
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.machine.torque import iron_drag
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
@@ -244,7 +245,9 @@ def values_of(drive: MachineFile, folder: Path) -> dict[str, tuple[float, float]
     if "J_load_kgm2" in drive.simulation:
         truth["J_kgm2"] += truth_of(drive, "J_load_kgm2")
     if truth_of(drive, "iron_loss_ohm"):
-        truth["B_nms"] += iron_drag(*(truth_of(drive, name) for name in ("pole_pairs", "psi_f_wb", "iron_loss_ohm")))
+        magnet = replace(drive.machine, psi_f_wb=truth["psi_f_wb"])
+        psi = magnet_flux_at(magnet, truth_of(drive, "T_magnet_c"))  # coasting is braked by the magnet as warm as it is
+        truth["B_nms"] += iron_drag(magnet.pole_pairs, psi, truth_of(drive, "iron_loss_ohm"))
     return {
         name: (
             100.0 * (found[name].value / truth[name] - 1.0),
