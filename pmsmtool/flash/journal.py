@@ -283,13 +283,13 @@ class JournalFolder:
         return None
 
     def begin(self, snapshot: Snapshot) -> Snapshot:
-        """Put a new journal on disk and return it; of one still open, the old contents are kept.
+        """Put a new journal on disk and return it; of one still open, or done and repeated, the old contents are kept.
 
         An interrupted download left the drive somewhere between its old and new set. What counts as
-        old is what stood there before the first of them.
+        old is what stood there before the first of them, and so it is where the same set goes to a drive that holds it.
         """
         previous = self.last()
-        if previous is not None and previous.state == "open":
+        if previous is not None and (previous.state == "open" or _repeats(previous, snapshot)):
             snapshot = merged(previous, snapshot)
         elif previous is not None:
             self._archive(previous)
@@ -305,6 +305,14 @@ class JournalFolder:
         text = snapshot.dumps()
         name = hashlib.sha256(text.encode()).hexdigest()[:_HASH_DIGITS]
         write_snapshot(self.path.with_name(f"journal-{name}.json"), snapshot)
+
+
+def _repeats(first: Snapshot, second: Snapshot) -> bool:
+    """Return whether a download writes what the finished one before it wrote, to a drive that holds it."""
+    held = {(e.index, e.sub, e.new, e.new) for e in first.entries if _marks_last(e) < 0}
+    return first.state == "done" and held == {
+        (e.index, e.sub, e.old, e.new) for e in second.entries if _marks_last(e) < 0
+    }
 
 
 def merged(first: Snapshot, second: Snapshot) -> Snapshot:

@@ -37,7 +37,8 @@ class Change:
     old, new : bytes
         Contents before and after; equal bytes are not written.
     old_value, wanted, held : float
-        Value on the drive, value asked for, value the drive will hold (SI); NaN for tables.
+        Value on the drive, value asked for, value the drive will hold (SI); NaN for tables, and where nobody says what
+        the drive's own scale is.
     unit : str
         Of the values.
     """
@@ -253,7 +254,7 @@ def _hex(data: bytes) -> str:
 
 
 def _row(change: Change, mark: str = "") -> tuple[str, str, str, str, str]:
-    if math.isnan(change.wanted) and address_in(change.name) is not None:
+    if math.isnan(change.wanted) and (change.name in BY_NAME or address_in(change.name) is not None):
         return change.name, _number(change.old), _number(change.new), "", mark
     if math.isnan(change.wanted):
         return change.name, f"{len(change.old)} B", f"{len(change.new)} B", "", f"{_cells(change)}  {mark}".strip()

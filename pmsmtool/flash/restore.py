@@ -194,8 +194,8 @@ def restore_plan(drive_map: DriveMap, snapshot: Snapshot, found: Mapping[str, by
         if entry.name in _MARK_NAMES:
             continue
         scalar = entry.name in drive_map.cells
-        value = wanted[entry.name] if scalar else math.nan
-        old_value = before.get(entry.name, math.nan) if scalar else math.nan
+        value = wanted.get(entry.name, math.nan)  # none of gains in amperes, or per increment, of unknown size
+        old_value = before.get(entry.name, math.nan)
         by_address = address_in(entry.name) is not None
         unit = BY_NAME[entry.name].unit if scalar else "" if by_address else table_unit(entry.name)
         change = Change(entry.name, entry.index, entry.sub, found[entry.name], entry.old, old_value, value, value, unit)

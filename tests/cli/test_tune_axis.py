@@ -36,6 +36,10 @@ def test_gains_of_the_axis_reach_the_drive(tool: Tool, tmp_path: Path) -> None:
     assert code == 0 and facts["axis_stored_error_rad"] == pytest.approx(facts["axis_error_rad"], rel=0.05)
     code, _, said = tool(*again, "ingenia")
     assert code == 2 and "not of a drive of the map" in said
+    # a gain in amperes is as many N m as the drive's torque per ampere says, which no snapshot holds: bytes go back
+    code, _, said = tool("restore", *DRIVE, "--yes")
+    assert code == 0 and "12 of 12 objects change" in said and "-> 0x0005997C" in said, said
+    assert tool("verify", "axis.params.toml", *DRIVE)[0] == 1
 
 
 def test_a_drive_without_units_gets_a_table_and_exit_code_10(tool: Tool) -> None:
