@@ -35,23 +35,25 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
     from pmsmtool.errors import VerifyMismatch
     from pmsmtool.flash.journal import read_snapshot
     from pmsmtool.flash.restore import check_snapshot, plan_download, plan_restore
+    from pmsmtool.flash.whole_drive import is_whole, readdressed, whole_map
 
     drive_map = map_of_drive(bus, map_file, OWN_FAMILY)
-    backup = source.suffix == ".json"
+    snapshot = read_snapshot(source) if source.suffix == ".json" else None
     with open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
+        if snapshot is not None and is_whole(snapshot):  # bytes by address need no map
+            node.map, snapshot = whole_map(node.identity()), readdressed(snapshot, node.node)
         identity = checked_identity(node, out)
-        if backup:
-            snapshot = read_snapshot(source)
+        if snapshot is None:
+            plan = plan_download(node, load_parameters(source, drive_map))
+        else:
             check_snapshot(node.map, snapshot, identity, other_drive=other_drive)
             plan = plan_restore(node, snapshot)
-        else:
-            plan = plan_download(node, load_parameters(source, drive_map))
     equal = len(plan.entries) - len(plan.changes)
     text = [f"{equal} of {len(plan.entries)} objects match (values only; run prove to test behaviour)"]
     out.result("verify", {"identity": identity, "ok": not plan.changes, **plan_facts(plan)}, text)
     if plan.changes:
         chosen = "" if map_file is None else f" --map {map_file}"
-        command = f"restore{' --other-drive' if other_drive else ''}" if backup else "flash-params"
+        command = f"restore{' --other-drive' if other_drive else ''}" if snapshot else "flash-params"
         raise VerifyMismatch(
             f"{len(plan.changes)} of {len(plan.entries)} objects hold something else; listed: drive -> {source.name}",
             where=f"node {identity.node}",

@@ -171,6 +171,8 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     outcome = tool("--sim", first, "backup", "--eds", str(path), "-o", "drive.json", "--json")
     left_out = json.loads(outcome.stdout)["left_out"]
     assert outcome.exit_code == 0 and "0x6040:00" in str(left_out)
+    same = tool("--sim", first, "verify", "drive.json")  # it was refused: "no map names this drive"
+    assert same.exit_code == 0 and "objects match" in same.stdout, same.stderr
     told = [line for line in outcome.stderr.splitlines() if line.startswith("not saved")]
     assert len(told) == len(set(left_out.values())), "one line for a reason"
     assert "serial" in str(tool("--sim", spare, "--yes", "restore", "drive.json").exception)
@@ -179,6 +181,7 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         node = DriveNode(connection, 1)
         for entry in read_snapshot(tmp_path / "drive.json").entries:
             assert node.sdo.read(entry.index, entry.sub) == entry.old
+    assert tool("--sim", spare, "verify", "drive.json", "--other-drive").exit_code == 0
     again = tool("--sim", spare, "--yes", "restore", "drive.json", "--other-drive")
     assert again.exit_code == 0 and "nothing was done" in again.stdout
     undone = tool("--sim", spare, "--yes", "restore")
