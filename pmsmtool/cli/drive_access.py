@@ -222,7 +222,7 @@ def claimed_node(connection: Connection, node: int | None) -> int:
     SecondMaster
         Another program works with the drive.
     SafetyRefusal
-        Gains that an interrupted `map learn` left changed cannot be restored.
+        What an interrupted run left changed cannot be restored.
     """
     from pmsmtool.drive.drive_lock import claim
 
@@ -233,7 +233,7 @@ def claimed_node(connection: Connection, node: int | None) -> int:
 
 
 def _restore_gains(connection: Connection, node_id: int) -> None:
-    """Bring back what a killed `map learn` left changed, before anything else is done with the drive."""
+    """Bring back what a killed run left changed, before anything else is done with the drive."""
     from pmsmtool.flash.gain_journal import any_left, restore_left
 
     if not any_left():
@@ -246,8 +246,8 @@ def _restore_gains(connection: Connection, node_id: int) -> None:
     finally:
         node.close()
     if count:
-        gains = counted(count, "gain")
-        click.echo(f"node {node_id}: {gains} restored that an interrupted `map learn` left changed", err=True)
+        objects = counted(count, "object")
+        click.echo(f"node {node_id}: {objects} restored that an interrupted run left changed", err=True)
 
 
 def choose_node(connection: Connection, node: int | None) -> int:

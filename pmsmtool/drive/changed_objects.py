@@ -1,19 +1,32 @@
 # SPDX-License-Identifier: MIT
-"""Objects of a drive that the guard lets be changed: what they held before, and how it is brought back."""
+"""Objects of a drive that the guard lets be changed: what they held before, and how it is brought back.
+
+A program that is killed brings nothing back, and what is stored next would keep its lowered limits. So of a drive with
+a serial number a file says what is lent, and the next command that opens the drive brings it back.
+"""
 
 from __future__ import annotations
+
+import contextlib
+import json
+from pathlib import Path
 
 from pmsmtool.bus.busy import is_busy, when_ready
 from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.errors import DriveFault, SdoAbort, VerifyMismatch
+from pmsmtool.drive.drive_node import DriveNode, is_safe
+from pmsmtool.drive.port import Identity
+from pmsmtool.errors import ConfigError, DriveFault, SdoAbort, VerifyMismatch
+from pmsmtool.files import make_folder, read_text, write_file
+from pmsmtool.resources import user_folder
 
 _Object = tuple[int, int]
 _MARKS: tuple[_Object, ...] = tuple(
     (mark.index, mark.sub) for mark in (objects.CONFIGURATION_DATE, objects.CONFIGURATION_TIME)
 )
 """Cleared by every change of another object."""
+FOLDER = "lent"
 BUSY_S = 5.0
 """A drive that refuses because it is busy is asked again for so long."""
 
@@ -31,6 +44,7 @@ class ChangedObjects:
         self._drive = drive
         self._node = drive.node
         self._before: dict[_Object, bytes] = {}
+        self._lent: dict[_Object, bytes] = {}
         self._sure: set[_Object] = set()
 
     @property
@@ -63,6 +77,8 @@ class ChangedObjects:
         self._node.before_write = None
         back: set[_Object] = set()
         when_ready(self._node.connection, lambda: self._bring_back(back), BUSY_S)
+        if self._lent and (path := _path_of(self._drive.identity)) is not None:
+            path.unlink(missing_ok=True)
         return len(back)
 
     def _bring_back(self, back: set[_Object]) -> None:
@@ -108,13 +124,51 @@ class ChangedObjects:
                 hint="reset the drive: it comes back with what it has stored",
             )
 
-    def _note(self, index: int, sub: int) -> None:
+    def _note(self, index: int, sub: int, data: bytes = b"") -> None:
         if (index, sub) not in self._before:
             try:
                 self._before[index, sub] = self._read(index, sub)
             except SdoAbort:
                 return  # cannot be read, so it cannot be restored; nothing the guard writes is of that kind
+        if data and not self._node.map.staging:
+            self._lent[index, sub] = data
+            self._keep()
+
+    def _keep(self) -> None:
+        """Say in the drive's file what is lent; a killed process leaves it."""
+        if (path := _path_of(self._drive.identity)) is not None:
+            rows = {f"{i:04X}:{s:02X}": (self._before[i, s].hex(), new.hex()) for (i, s), new in self._lent.items()}
+            with contextlib.suppress(ConfigError):
+                make_folder(path.parent)
+                write_file(path, json.dumps(rows))
 
     def _read(self, index: int, sub: int) -> bytes:
         domain = (index, sub) in (objects.EXCITATION_BUFFER, *self._node.map.tables.values())
         return self._node.sdo.upload(index, sub, mode=Mode.BLOCK if domain else Mode.SEGMENTED).data
+
+
+def any_lent() -> bool:
+    """Whether a run on any drive did not bring back what it was lent; looks at the disk alone."""
+    return any((user_folder() / FOLDER).glob("*.json"))
+
+
+def restore_lent(node: DriveNode, identity: Identity) -> int:
+    """Bring back what a killed run left changed, where the drive is off and holds it still; return how many objects."""
+    path, count = _path_of(identity), 0
+    if path is None or not path.is_file() or not is_safe(node.state()):
+        return 0
+    with contextlib.suppress(ValueError):  # a file that is damaged says nothing
+        for name, (old, new) in reversed(json.loads(read_text(path)).items()):
+            index, sub = (int(part, 16) for part in name.split(":"))
+            with contextlib.suppress(SdoAbort):
+                if old != new and node.sdo.read(index, sub).hex() == new:
+                    node.sdo.download(index, sub, bytes.fromhex(old))
+                    count += 1
+    path.unlink(missing_ok=True)
+    return count
+
+
+def _path_of(identity: Identity) -> Path | None:
+    """Return the file of a drive; None of one without a serial number, which another may be taken for."""
+    name = f"{identity.vendor:08x}-{identity.product:08x}-{identity.serial}.json"
+    return user_folder() / FOLDER / name if identity.serial else None

@@ -46,8 +46,8 @@ NOT_READ = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY)
 """Refusals to read an object that count as missing: what cannot be read back proves nothing."""
 OF_LENGTH = (AbortCode.LENGTH, AbortCode.TOO_LONG, AbortCode.TOO_SHORT)
 
-Watcher = Callable[[int, int], None]
-"""Called with index and sub-index before an object is written."""
+Watcher = Callable[[int, int, bytes], None]
+"""Called with index, sub-index and bytes before an object is written."""
 
 
 class DriveNode:
@@ -138,7 +138,7 @@ class DriveNode:
     def write_bytes(self, index: int, sub: int, data: bytes, *, retry: Retry = Retry.READ_BACK) -> None:
         """Write the bytes of an object."""
         if self.before_write is not None:
-            self.before_write(index, sub)
+            self.before_write(index, sub, data)
         self.sdo.download(index, sub, data, retry=retry)
 
     def has(self, index: int, sub: int) -> bool:

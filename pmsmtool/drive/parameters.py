@@ -204,8 +204,8 @@ class DriveParameters:
             Something reads back differently.
         """
         if self.node.before_write is not None:
-            for name in new:
-                self.node.before_write(*self.map.address(name))
+            for name, data in new.items():
+                self.node.before_write(*self.map.address(name), data)
         if not self.map.staging:
             self._write_all(new, progress)
             return
@@ -224,8 +224,8 @@ class DriveParameters:
     def write_live(self, new: Mapping[str, bytes]) -> None:
         """Write single parameters that act at once (live gains of an enabled drive), and read them back."""
         if self.node.before_write is not None:
-            for name in new:
-                self.node.before_write(*self.map.address(name))
+            for name, data in new.items():
+                self.node.before_write(*self.map.address(name), data)
         self._write_all(new, _no_progress)
 
     def _write_all(self, new: Mapping[str, bytes], progress: Progress) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from pmsmtool.drive.changed_objects import any_lent, restore_lent
 from pmsmtool.drive.drive_node import DriveNode, is_safe, state_text
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import SafetyRefusal, VerifyMismatch
@@ -74,11 +75,11 @@ def path_of(identity: Identity) -> Path:
 
 def any_left() -> bool:
     """Whether a measurement of any drive ended without its end; looks at the disk alone."""
-    return any((user_folder() / "journals").glob(f"*/{FILE}"))
+    return any_lent() or any((user_folder() / "journals").glob(f"*/{FILE}"))
 
 
 def restore_left(node: DriveNode, identity: Identity) -> int:
-    """Bring back the gains that an ended measurement left changed; return how many objects were written.
+    """Bring back what a killed run left changed, its gains included; return how many objects were written.
 
     Raises
     ------
@@ -87,9 +88,9 @@ def restore_left(node: DriveNode, identity: Identity) -> int:
     VerifyMismatch
         An object does not hold its old value again.
     """
-    path = path_of(identity)
+    path, lent = path_of(identity), restore_lent(node, identity)
     if not path.exists():
-        return 0
+        return lent
     snapshot = read_snapshot(path)
     state = node.state()
     if not is_safe(state):
@@ -113,7 +114,7 @@ def restore_left(node: DriveNode, identity: Identity) -> int:
         node.sdo.download(entry.index, entry.sub, entry.old)
     _confirm(node, snapshot)
     path.unlink(missing_ok=True)
-    return len(changed)
+    return lent + len(changed)
 
 
 def _confirm(node: DriveNode, snapshot: Snapshot) -> None:

@@ -185,7 +185,7 @@ class WholeDrive(DriveParameters):
         for _ in range(ROUNDS):
             if self.node.before_write is not None:
                 for name in due:
-                    self.node.before_write(*self.map.address(name))
+                    self.node.before_write(*self.map.address(name), wanted[name])
             self._write_in_order(due, wanted)
             progress(len(wanted) - len(due), len(wanted))
             before, due = due, self._different(wanted)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,7 +16,7 @@ from pmsmtool.bus.nmt import NmtState
 from pmsmtool.drive import heartbeat as beating
 from pmsmtool.drive import objects
 from pmsmtool.drive.borrowed_pdo import BorrowedPdo
-from pmsmtool.drive.changed_objects import ChangedObjects
+from pmsmtool.drive.changed_objects import ChangedObjects, any_lent, restore_lent
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat, expect_pdo, expects_pdos
@@ -23,6 +24,7 @@ from pmsmtool.drive.motion_objects import MAX_TORQUE_PERMILLE, Quantity
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.own_limits import LEAST_COUNTS, lower_limits, put_limit
 from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.drive.port import Identity
 from pmsmtool.drive.process_data import LiveValues, live_values, sent_every_s
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.shipped_maps import load_family
@@ -359,11 +361,37 @@ def test_the_last_pdo_that_can_be_lent_is_expected(
 
 
 def changed_of(node: DriveNode) -> ChangedObjects:
-    drive: Any = SimpleNamespace(node=node, parameters=DriveParameters(node), replace=None)
+    drive: Any = SimpleNamespace(node=node, parameters=DriveParameters(node), replace=None, identity=LENT)
     return ChangedObjects(drive)
 
 
 A, B = DriveObject(0x6071, 0, "h"), DriveObject(0x60FF, 0, "i")
+LENT = Identity(NODE, 0xA51, 2, 3, 417, "", "", "")
+
+
+@pytest.mark.parametrize("serial", [417, 0])
+def test_what_a_killed_run_left_comes_back_with_the_next_command(serial: int) -> None:
+    """The next download stored the lowered limits of a killed `identify` with its own values, and exited with 0."""
+    killed, identity = {A: 5, B: 6, objects.MODE: 3, objects.STATUSWORD: 0x40}, replace(LENT, serial=serial)
+    with node_of(killed, GENERIC) as (table, node):
+        changed = changed_of(node)
+        changed._drive.identity = identity
+        changed.begin()
+        for item, value in ((A, 50), (B, 60), (A, 70), (objects.MODE, 4)):
+            node.put(item, value)
+        assert any_lent() is bool(serial)
+        table.objects[0x60FF, 0] = B.encode(61)  # somebody else wrote it since: it stays
+        node.before_write = None
+        table.objects[0x6041, 0] = objects.STATUSWORD.encode(0x27)
+        assert restore_lent(node, identity) == 0, "energised"
+        table.objects[0x6041, 0] = objects.STATUSWORD.encode(0x40)
+        assert restore_lent(node, identity) == (2 if serial else 0)
+        assert (node.get(A), node.get(B)) == (5.0 if serial else 70.0, 61.0) and not any_lent()
+    with node_of({A: 5}, GENERIC) as (_, node):
+        changed = changed_of(node)
+        changed.begin()
+        node.put(A, 50)
+        assert any_lent() and changed.restore() == 1 and not any_lent()
 
 
 def test_what_was_changed_comes_back_in_reverse_and_once() -> None:

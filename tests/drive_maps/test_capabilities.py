@@ -90,7 +90,7 @@ def test_examining_only_reads() -> None:
     with connect("pmsmsim", CHANNEL + "&drive=cia402") as connection:
         node = DriveNode(connection, 1)
         written: list[tuple[int, int]] = []
-        node.before_write = lambda index, sub: written.append((index, sub))
+        node.before_write = lambda index, sub, _: written.append((index, sub))
         session = connection.bus.line.nodes[0].session  # type: ignore[attr-defined]
         before = {entry.row.index << 8 | entry.row.sub: entry.value for entry in session.dictionary}
         examine(node)

@@ -74,7 +74,7 @@ def test_objects_are_written_in_an_order_that_a_drive_takes() -> None:
     with Connection(ScriptedBus(table)) as connection:
         node = DriveNode(connection, NODE, drive_map=whole_map(Identity(NODE, 1, 2, 3, 4, "", "", "")))
         drive, told = WholeDrive(node), list[tuple[int, int]]()
-        node.before_write = lambda index, sub: told.append((index, sub))
+        node.before_write = lambda index, sub, _: told.append((index, sub))
         drive.replace(wanted)
         assert drive.refused == {}
         assert {name: table.objects[node.map.address(name)] for name in wanted if wanted[name]} == {
