@@ -8,7 +8,7 @@ import math
 from pmsmtool.drive.port import Drive
 from pmsmtool.experiments.rotation import ROW_S
 from pmsmtool.experiments.signals import table
-from pmsmtool.experiments.vector_turn import come_to_rest, turn_vector
+from pmsmtool.experiments.vector_turn import REST_LIMIT_S, come_to_rest, turn_vector
 from pmsmtool.trace import Trace
 
 WAY_S = 2.5
@@ -55,7 +55,7 @@ def lead_half_a_turn(
         ``at_rest`` 1 in the three rows before, between and after the two ways.
     """
     turn_vector(drive, i_a, start_rad, 0.0)
-    come_to_rest(drive)
+    come_to_rest(drive, i_a, 0.0, limit_s=REST_LIMIT_S)
     rows = [_row(drive, 0.0, signals, at_rest=True)]
     way_rad = pole_pairs * MARGIN * HALF_TURN_RAD
     steps = max(STEPS, math.ceil(2.0 * way_rad / STEP_RAD))
@@ -65,10 +65,10 @@ def lead_half_a_turn(
         if abs(rows[-1]["theta_M_rad"] - rows[0]["theta_M_rad"]) >= MARGIN * HALF_TURN_RAD:
             break
     end = rows[-1]["theta_imposed_rad"]
-    come_to_rest(drive)
+    come_to_rest(drive, i_a, end, limit_s=REST_LIMIT_S)
     rows.append(_row(drive, end, signals, at_rest=True))
     rows += [_led(drive, i_a, end - angle, dwell_s, signals) for angle in _smooth(end, steps)]
-    come_to_rest(drive)
+    come_to_rest(drive, i_a, 0.0, limit_s=REST_LIMIT_S)
     rows.append(_row(drive, 0.0, signals, at_rest=True))
     drive.command_current(0.0, 0.0, fixed_angle_rad=0.0)
     return table(rows, [k * (dwell_s + ROW_S) for k in range(len(rows))], i_command_a=i_a)

@@ -135,13 +135,13 @@ def rotate_vector(drive: Drive, plan: RotationPlan, *, start_rad: float = 0.0) -
         ``theta_imposed_rad`` (electrical, unwrapped) and ``theta_M_rad`` (mechanical, unwrapped), one row per step.
     """
     drive.command_current(plan.i_a, 0.0, fixed_angle_rad=start_rad)
-    come_to_rest(drive)
+    come_to_rest(drive, plan.i_a, start_rad)
     angle, forward = _run(drive, plan, start_rad, plan.step_rad, None)
-    come_to_rest(drive)
+    come_to_rest(drive, plan.i_a, angle)
     angle, backward = _run(drive, plan, angle, -plan.step_rad, len(forward))
     whole = 2.0 * math.pi * round(angle / (2.0 * math.pi))
     turn_vector(drive, plan.i_a, angle, whole, max(BACK_LEAST_S, TURN_S * abs(whole - angle) / math.pi))
-    come_to_rest(drive)
+    come_to_rest(drive, plan.i_a, whole)
     drive.command_current(0.0, 0.0, fixed_angle_rad=whole)
     return forward, backward
 

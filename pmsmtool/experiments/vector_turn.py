@@ -45,7 +45,13 @@ LOOKS = 4
 REST_SPAN_RAD = 2e-3
 """Motion of the shaft (mechanical) over these that still is rest: one step of a 12-bit encoder."""
 REST_LIMIT_S = 3.0
-"""A rotor that has not come to rest by then swings on: the ramps add next to nothing to it."""
+"""A rotor that has not come to rest by then swings on, by what friction leaves of it for minutes: it is braked."""
+BRAKED_SHARE = 0.25
+"""Current while it returns, of that while it leaves: every half swing is half of the one before."""
+BRAKED_S = 20.0
+"""Longest braking (s): ten half swings of a load of 50 times the rotor's inertia on the first current (0.7 Hz)."""
+SLOW_LOOKS = 4
+"""Looks of a half swing from which on it is braked: of a quicker one the looks show too little."""
 
 
 def rising(steps: int) -> tuple[float, ...]:
@@ -67,15 +73,32 @@ def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float, turn
     return steps * TURN_DWELL_S
 
 
-def come_to_rest(drive: Drive) -> float:
-    """Wait until the encoder shows a shaft at rest, or a limit is over; return the time (s)."""
+def come_to_rest(drive: Drive, i_a: float, angle_rad: float, *, limit_s: float = REST_LIMIT_S + BRAKED_S) -> float:
+    """Wait until the encoder shows a shaft at rest on its vector, or a limit is over; return the time (s).
+
+    One that swings on slowly is braked: on a current vector it is a pendulum on a spring as stiff as the current. From
+    a turning point to its largest speed a small current pulls it, from there to the next turning point all of it.
+    """
     periods = max(1, round(0.25 * LOOK_S / drive.period_s))
     seen: deque[float] = deque(maxlen=LOOKS)
-    waited = 0.0
-    while waited < REST_LIMIT_S and (len(seen) < LOOKS or max(seen) - min(seen) > REST_SPAN_RAD):
+    waited, way, fastest, looks, slow, small = 0.0, 0.0, 0.0, 0, False, False
+    while waited < limit_s and (len(seen) < (seen.maxlen or LOOKS) or max(seen) - min(seen) > REST_SPAN_RAD):
         drive.wait(LOOK_S)
         waited += LOOK_S
         seen.append(drive.average(("theta_m_rad",), periods)["theta_m_rad"])
+        before, way = way, seen[-1] - seen[-2] if len(seen) > 1 else 0.0
+        turned = way * before <= 0.0
+        if turned and waited > REST_LIMIT_S:  # the end of a long swing looks like rest
+            seen = deque(seen, max(LOOKS, looks))
+        fastest, looks, slow = (
+            (abs(way), 0, looks >= SLOW_LOOKS) if turned else (max(fastest, abs(way)), looks + 1, slow)
+        )
+        returns = slow and (turned or (small and abs(way) >= fastest))
+        if waited > REST_LIMIT_S and returns is not small:
+            small = returns
+            drive.command_current(i_a * (BRAKED_SHARE if small else 1.0), 0.0, fixed_angle_rad=angle_rad)
+    if small:
+        drive.command_current(i_a, 0.0, fixed_angle_rad=angle_rad)
     return waited
 
 

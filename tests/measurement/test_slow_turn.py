@@ -11,7 +11,7 @@ import pytest
 
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.experiments.rotation import QUICK_DWELL_S, QUICK_STEP_RAD, SWING, RotationPlan, rotate_vector, step_within
-from pmsmtool.experiments.vector_turn import LOOK_S, RAMP_S, REST_LIMIT_S, come_to_rest, rising, turn_vector
+from pmsmtool.experiments.vector_turn import BRAKED_S, LOOK_S, RAMP_S, REST_LIMIT_S, come_to_rest, rising, turn_vector
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import ROTATIONS, Measurement
 from pmsmtool.trace import Trace
@@ -116,8 +116,29 @@ def test_rest_is_not_taken_for_the_end_of_a_swing_and_not_waited_for_for_ever() 
         def wait(self, seconds: float) -> None:
             self.elapsed += seconds
 
-    assert come_to_rest(Endless(7.0)) == pytest.approx(REST_LIMIT_S, abs=LOOK_S)  # type: ignore[arg-type]
-    assert come_to_rest(SwingingRotor(7.0)) < 0.2  # type: ignore[arg-type]
+    endless = Endless(7.0)
+    assert come_to_rest(endless, 1.0, 0.0) == pytest.approx(REST_LIMIT_S + BRAKED_S, abs=LOOK_S)  # type: ignore[arg-type]
+    assert endless.i_a == 1.0  # all of the current again
+    short = come_to_rest(Endless(7.0), 1.0, 0.0, limit_s=REST_LIMIT_S)  # type: ignore[arg-type]
+    assert short == pytest.approx(REST_LIMIT_S, abs=LOOK_S)
+    assert come_to_rest(SwingingRotor(7.0), 1.0, 0.0) < 0.2  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("swing_rad_s", "theta_rad"), [(4.5, 2.9), (3.0, 1.0), (9.0, 1.0)])
+def test_a_heavy_load_that_would_swing_for_minutes_is_braked(
+    swing_rad_s: float, theta_rad: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """50 times the rotor's inertia as load: every slow turn was refused, and with it L, psi_f and J."""
+    monkeypatch.setattr("tests.measurement.test_slow_turn.FRICTION", 1e-3)
+    drive = SwingingRotor(swing_rad_s, theta_rad=theta_rad)
+    drive.command_current(1.0, 0.0, fixed_angle_rad=0.0)
+    come_to_rest(drive, 1.0, 0.0, limit_s=REST_LIMIT_S)  # type: ignore[arg-type]
+    left_swinging = 2.0 * max(map(abs, drive.speeds[-2000:])) / swing_rad_s
+    waited = come_to_rest(drive, 1.0, 0.0)  # type: ignore[arg-type]
+    drive.wait(2.0)
+    swings = max(map(abs, drive.speeds[-2000:])) / swing_rad_s
+    assert left_swinging > math.radians(90.0) and swings < math.radians(3.0) and drive.i_a == 1.0
+    assert waited < REST_LIMIT_S + BRAKED_S
 
 
 def test_a_ramp_rises_smoothly_and_never_beyond_the_speed() -> None:
