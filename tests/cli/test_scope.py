@@ -18,9 +18,11 @@ from typing import Any
 
 import pytest
 
+from benchmarks.live_page import looks
 from pmsmtool.cli import live_server, scope
 from pmsmtool.cli.lazy_group import load_command
 from pmsmtool.cli.live_server import MOST_CONNECTIONS, MOST_NUMBERS, MOST_ROWS, LiveServer, Samples
+from pmsmtool.commissioning.printed_page import find_browser
 from pmsmtool.errors import ConfigError
 from pmsmtool.report.report import template
 from pmsmtool.trace_file import read_trace
@@ -363,6 +365,15 @@ def acted(*acts: tuple[str, str, Any]) -> dict[str, Any]:
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
     return found
+
+
+@pytest.mark.chain
+@pytest.mark.wall_clock
+@pytest.mark.skipif(find_browser() is None, reason="no browser on this computer")
+def test_no_sample_is_lost_on_the_way_to_a_browser() -> None:
+    """Ten signals at 1 kHz for 3 s; ten minutes: ``python -m benchmarks.live_page``."""
+    last = list(looks(str(find_browser()), 3.0, 1.0))[-1]
+    assert (last.latest + 1, last.lost, last.rows) == (3000, 0, 3000)
 
 
 @pytest.mark.chain
