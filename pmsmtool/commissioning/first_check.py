@@ -190,7 +190,9 @@ def _counts(drive: CanopenDrive, stated: MachineFile) -> Finding:
     """Compare the counts per turn that the drive is set for with the file's."""
     held, bits = held_values(drive).get("encoder_counts"), stated.encoder.bits
     if held is None or not bits:
-        missing = "the drive does not show them" if held is None else "no file states them"
+        missing = (
+            "the drive does not show them" if held is None else "not stated: bits in [encoder] of the machine file"
+        )
         return Finding("encoder counts", NOT_SEEN, missing)
     if round(held) == 1 << bits:
         return Finding("encoder counts", OK, f"{held:.0f} per turn, as stated")

@@ -233,7 +233,7 @@ def _counts(drive: StandardDrive, stated: MachineFile) -> Finding:
     held, bits = abs(drive.counts_per_turn), stated.encoder.bits
     factor = held / (1 << bits) if bits else math.nan
     if not bits:
-        return Finding("encoder counts", NOT_CHECKED, "no file states them")
+        return Finding("encoder counts", NOT_CHECKED, "not stated: bits in [encoder] of the machine file")
     if any(math.isclose(factor, usual, rel_tol=1e-9) for usual in COUNT_FACTORS):
         shown = f"the drive is set for {held:.6g} per turn, {1 << bits} are stated"
         return Finding("encoder counts", WRONG, shown, "lines given for counts, or the reverse")
