@@ -118,6 +118,7 @@ def _tell_usage(error: click.ClickException) -> int:
         error = click.NoSuchOption(error.option_name, possibilities=near, ctx=error.ctx)
     place = f"{error.ctx.command_path} --help" if isinstance(error, click.UsageError) and error.ctx else ""
     message = error.format_message().strip().replace("a valid integer range", "a whole number")
+    message = message.replace("a valid float", "a number").replace("requires an argument", "needs a value behind it")
     _tell(ConfigError(message[:1].lower() + message[1:].rstrip("."), hint=place))
     return int(ExitCode.USAGE)
 

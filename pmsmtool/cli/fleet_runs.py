@@ -90,7 +90,7 @@ def _runs(folder: Path) -> tuple[dict[str, list[Run]], list[str]]:
             left_out.append(f"{path.name}: nothing in it was measured")
     if not found:
         raise ConfigError(
-            "no run with identified values in here", where=str(folder),
+            "no run with identified values in here" if folder.is_dir() else "no such folder", where=str(folder),
             hint="give the folder that holds the run directories, usually runs",
         )  # fmt: skip
     return found, left_out

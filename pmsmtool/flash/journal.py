@@ -130,7 +130,8 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DamagedSnapshot(f"is no whole backup: {error}", where=where, likely="it was edited or cut") from error
+        what = f"the file is no whole backup: {error}"
+        raise DamagedSnapshot(what, where=where, likely="it was edited or cut") from error
     if not isinstance(document, dict):
         raise DamagedSnapshot("is no backup: it holds no names", where=where)
     schema, check = document.get("schema"), document.pop("check", None)

@@ -69,6 +69,20 @@ def test_a_machine_file_names_everything_that_is_missing(capsys: pytest.CaptureF
     assert first == "error: missing options: --name, --pole-pairs, --u-dc, --pwm, --output, --ke or --kt"
 
 
+@pytest.mark.parametrize(
+    ("typed", "says"),
+    [
+        ("check --speed-max", "option '--speed-max' needs a value behind it"),
+        ("tune interior-2k2 -o d.toml --eps 2O", "'2O' is not a number"),
+        ("fleet nowhere", "no such folder"),
+    ],
+)
+def test_a_plain_mistake_is_named_in_plain_words(typed: str, says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Before: "requires an argument", "not a valid float", "no run with identified values in here"."""
+    assert run(typed.split()) == 2
+    assert says in capsys.readouterr().err
+
+
 def helps(command: click.Command, context: click.Context, typed: str) -> Iterator[tuple[str, str]]:
     """Every command as typed, and its help as a terminal shows it."""
     yield typed, command.get_help(context)
