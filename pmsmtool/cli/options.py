@@ -202,18 +202,16 @@ def _yes_parameter(auto: bool, moves: bool = True) -> Option:
     )
 
 
-def _envelope_parameters(moves: bool) -> tuple[Option, ...]:
-    """Return the limits of a motion and the serial number; what moves nothing lists no limits, but takes them."""
-    unlisted = not moves
+def _envelope_parameters(unlisted: bool) -> tuple[Option, ...]:
+    """Return the limits of a motion and the serial number; what moves nothing takes the limits unlisted."""
+    shaft, current = "What the shaft may do.", "Largest current, e.g. 12Apk or 8.5Arms."
+    speed = "Largest speed of the shaft, e.g. 1200rpm."
     return (
-        click.option("--i-max", type=LARGEST_CURRENT, metavar="CURRENT", hidden=unlisted,
-                     help="Largest current, e.g. 12Apk or 8.5Arms."),
-        click.option("--speed-max", type=LARGEST_SPEED, metavar="SPEED", hidden=unlisted,
-                     help="Largest speed of the shaft, e.g. 1200rpm."),
-        click.option("--shaft", type=click.Choice(["free", "locked", "coupled"]), hidden=unlisted,
-                     help="What the shaft may do."),
+        click.option("--i-max", type=LARGEST_CURRENT, metavar="CURRENT", hidden=unlisted, help=current),
+        click.option("--speed-max", type=LARGEST_SPEED, metavar="SPEED", hidden=unlisted, help=speed),
+        click.option("--shaft", type=click.Choice(["free", "locked", "coupled"]), hidden=unlisted, help=shaft),
         click.option("--serial", type=SERIAL, metavar="NUMBER", help="Serial number the drive must have."),
-    )  # fmt: skip
+    )
 
 
 _SURROUNDINGS_PARAMETERS: tuple[Option, ...] = (
@@ -435,9 +433,9 @@ def _allowing(function: Function, options: tuple[Option, ...]) -> Function:
 
 def motion_options(function: Function) -> Function:
     """Add the envelope and ``--yes`` to a command that moves the machine; it receives ``motion: MotionOptions``."""
-    return _allowing(function, (*_envelope_parameters(True), *_SURROUNDINGS_PARAMETERS, _yes_parameter(False)))
+    return _allowing(function, (*_envelope_parameters(False), *_SURROUNDINGS_PARAMETERS, _yes_parameter(False)))
 
 
 def write_options(function: Function) -> Function:
     """Add ``--yes`` and what it needs to a command that writes the drive; it receives ``motion: MotionOptions``."""
-    return _allowing(function, (*_envelope_parameters(False), _yes_parameter(False, moves=False)))
+    return _allowing(function, (*_envelope_parameters(True), _yes_parameter(False, moves=False)))
