@@ -92,6 +92,8 @@ class Connection:
         COB-IDs seen.
     sent : dict of int to deque
         The last requests sent per watched COB-ID, to tell our own echo from a second master.
+    echo : tuple or None
+        The frame (COB-ID, data, time) that was last told for one.
     sends : Counter of int
         How many frames were sent per COB-ID.
     deaf_s : float
@@ -110,6 +112,7 @@ class Connection:
         self.deaf_s = 0.0
         self.heard: set[int] = set()
         self.sent: dict[int, deque[bytes]] = {}
+        self.echo: tuple[int, bytes, float] | None = None
         self.sends: Counter[int] = Counter()
         self.listeners: list[Callable[[can.Message], None]] = []
         self.at_close: list[Callable[[], None]] = []

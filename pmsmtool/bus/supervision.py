@@ -246,8 +246,8 @@ class Supervision:
             self._deaf_then_s = self._connection.deaf_s
 
     def _on_master(self, cob_id: int, data: bytes, timestamp: float) -> None:
-        if data in self._connection.sent.get(cob_id, ()):
-            self._connection.sent[cob_id].clear()  # our own, echoed
+        if self._is_echo(cob_id, data, timestamp):
+            self._connection.sent[cob_id].clear()
         else:
             self.foreign_requests += 1
             name = "another pmsmtool" if cob_id == HEARTBEAT_ID + TOOL_NODE else "a master this drive supervises"
@@ -268,13 +268,19 @@ class Supervision:
     def _on_request(self, cob_id: int, data: bytes, timestamp: float) -> None:
         if cob_id == NMT_ID and data[1:2] not in (b"\0", bytes((self.node,))):
             return
-        sent = self._connection.sent[cob_id]
-        if data in sent:
-            sent.remove(data)
+        if self._is_echo(cob_id, data, timestamp):
             self._echoes = True
         elif cob_id == NMT_ID or not _only_looks(data):
             self.foreign_requests += 1
             self.foreign = "an NMT command" if cob_id == NMT_ID else _described(data)
+
+    def _is_echo(self, cob_id: int, data: bytes, timestamp: float) -> bool:
+        """Whether a frame is our own, which comes back once; every other supervision of the node is told of it, too."""
+        sent, frame = self._connection.sent.get(cob_id, ()), (cob_id, data, timestamp)
+        if data in sent:
+            self._connection.sent[cob_id].remove(data)
+            self._connection.echo = frame
+        return self._connection.echo == frame
 
     def _on_answer(self, cob_id: int, data: bytes, timestamp: float) -> None:
         # An echo comes before the answer, or right behind it where adapter and node race. What is older has none to

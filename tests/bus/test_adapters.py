@@ -180,6 +180,8 @@ class ScriptedConnection:
     def __init__(self) -> None:
         self.clock = VirtualClock()
         self.sent: dict[int, deque[bytes]] = {}
+        self.echo: tuple[int, bytes, float] | None = None
+        self.arrived = 0
         self.deaf_s = 0.0
         self._subscribers: dict[int, list[Callable[[int, bytes, float], None]]] = {}
 
@@ -187,8 +189,9 @@ class ScriptedConnection:
         self._subscribers.setdefault(cob_id, []).append(callback)
 
     def arrive(self, cob_id: int, data: bytes = bytes(8)) -> None:
+        self.arrived += 1
         for callback in self._subscribers.get(cob_id, ()):
-            callback(cob_id, data, 0.0)
+            callback(cob_id, data, 1e-3 * self.arrived)
 
 
 def test_buffers_altered_on_send(request: pytest.FixtureRequest) -> None:

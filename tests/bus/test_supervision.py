@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from pmsmtool.bus.connect import Connection
-from pmsmtool.bus.nmt import NmtCommand, NmtState, reset_node, send_nmt
+from pmsmtool.bus.nmt import TOOL_NODE, NmtCommand, NmtState, reset_node, send_nmt
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.bus.supervision import EMERGENCIES_MAX, HeartbeatLost, NodeReset, SecondMaster, Supervision
 from pmsmtool.errors import DriveFault, DriveTimeout
@@ -172,6 +172,23 @@ def test_own_echo_is_no_second_master(bus: ScriptedBus, connection: Connection, 
     connection.wait(0.01)
     supervision.check()
     assert supervision.foreign_requests == 0
+
+
+def test_an_echo_is_told_to_every_supervision_of_the_node(
+    bus: ScriptedBus, connection: Connection, supervision: Supervision
+) -> None:
+    """`check` opens the node twice: over udp_multicast each of its own requests was another master's to the second."""
+    bus.echo = True
+    second = Supervision(connection, NODE)
+    channel = SdoChannel(connection, NODE, check=second.check)
+    channel.upload(*BIG, size=4000)
+    connection.send(0x700 + TOOL_NODE, b"\x05")
+    connection.wait(0.01)
+    assert (supervision.foreign_requests, second.foreign_requests) == (0, 0)
+    bus.deliver(0x600 + NODE, bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)))
+    connection.wait(0.01)
+    assert (supervision.foreign_requests, second.foreign_requests) == (1, 1)
+    second.close()
 
 
 def test_any_frame_of_the_node_is_life(bus: ScriptedBus, connection: Connection, supervision: Supervision) -> None:
