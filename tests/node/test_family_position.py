@@ -9,6 +9,7 @@ from pmsmtool.axis.design import from_pid
 from pmsmtool.axis.loops import AxisGains
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.sim.node.family_position import PID, cascade_of, pid_of
 
@@ -36,4 +37,20 @@ def test_each_mode_has_its_own_gains_behind(mode: int, moving: bool) -> None:
         assert inner.number() == pytest.approx(own if moving else 2.0 * own, rel=1e-5)
         node.sdo.download(0x6060, 0, bytes([10 - mode]))
         assert inner.number() == pytest.approx(2.0 * own if moving else own, rel=1e-5)
+        node.close()
+
+
+@pytest.mark.parametrize(("family", "index"), [("epos4", 0x6081), ("ingenia", 0x2025)])
+def test_a_stored_profile_acts_after_a_reset(family: str, index: int) -> None:
+    """An EPOS4 showed the stored 1140 rpm and moved at 60: new gains seemed to follow 24 times better."""
+    with connect("pmsmsim", f"interior-2k2?drive={family}&nv=:memory:") as connection:
+        node = DriveNode(connection, 1, drive_map=load_family(family))
+        hardware = connection.bus.line.nodes[0]  # type: ignore[attr-defined]
+        item = DriveObject(index, 0, "f" if family == "ingenia" else "I")
+        speed, before = node.get(item), hardware.session.dictionary["cia402.profile_velocity"].number()
+        node.put(item, 19 * speed)
+        node.store()
+        node.reset()
+        assert node.get(item) == 19 * speed
+        assert hardware.session.dictionary["cia402.profile_velocity"].number() == pytest.approx(19 * before)
         node.close()

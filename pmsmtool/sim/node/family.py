@@ -134,7 +134,11 @@ class Face:
             dictionary.show(entry)
 
     def attach(self, dictionary: Dictionary, plant: Plant, power: PowerDrive, schedule: Schedule) -> None:
-        """Put the family's own functions over the running application."""
+        """Put the family's own functions over the running application, and what it kept of a move in effect."""
+        for cell in self.drive_map.cells.values():
+            kept = dictionary.find(cell.index, cell.sub)
+            if cell.name in PROFILE and kept.value:
+                dictionary.write(kept, kept.value)
         kind = RECORDERS.get(self.drive_map.capabilities.recorder)
         if kind is not None:
             kind(self.drive_map, dictionary, plant)
