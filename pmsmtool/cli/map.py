@@ -100,7 +100,7 @@ def learn_command(
         for name in (GAIN, INTEGRAL):
             found[name] = gain_object(node, name, *(asked.get(name) or gain_address(node, name)))
         speed_max = motion.speed_max_rad_s or SPEED_SHARE * rad_s_from_rpm(machine.top_rpm)
-        i_max = within_budget(drive, machine, motion.i_max_apk or drive.rated_apk, speed_max)
+        i_max = within_budget(drive, machine, motion.i_max_apk or min(drive.rated_apk, drive.shows_apk), speed_max)
         envelope = Envelope(
             i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S, shaft=motion.shaft or "free",
             load=motion.load, brake=motion.brake, acceleration_rad_s2=largest_acceleration(machine, i_max),

@@ -48,7 +48,7 @@ class PositionDrive(TorqueDrive):
         Following error at which the voltage is removed, unless the shaft is on its way to the demand; at ``WHOLE_WAY``
         times that, in any case.
     current_allowed_apk : float
-        Rated current, or the drive's own limit where that is smaller (A peak).
+        Rated current, or the drive's own limit or what it can show where that is smaller (A peak).
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
 
@@ -79,7 +79,7 @@ class PositionDrive(TorqueDrive):
             )  # fmt: skip
         self.error_limit_rad = math.inf
         kept = allowed(self.node, current_limits(self.node, self._rated_apk))
-        self.current_allowed_apk = self._rated_apk if kept is None else min(self._rated_apk, kept[1])
+        self.current_allowed_apk = min(self._rated_apk, math.inf if kept is None else kept[1], self.shows_apk)
         self.sends = True
         self._sending: AbstractContextManager[LiveValues] | None = None
         self._taken: list[tuple[float, float, float, float]] = []

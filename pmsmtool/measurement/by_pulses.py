@@ -222,6 +222,7 @@ def envelope_of(drive: CanopenDrive, request: IdentifyRequest, known: MachineFil
     for limit in current_limits(node, rated):  # what the drive allows now is not raised
         held = allowed(node, iter((limit,)))
         rated = rated if held is None else min(rated, held[1] / HEADROOM)
+    rated = min(rated, drive.shows_apk / HEADROOM)
     speed = allowed(node, speed_limits(node))
     rpm = (drive.parameters.held_value("motor.n_max_rpm") or UNLIMITED_RPM) if speed is None else speed[1]
     if known is not None:
