@@ -202,13 +202,13 @@ def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[C
     with bus.connect() as connection:
         try:
             drive = CanopenDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
-        except SdoAbort as abort:
+        except (SdoAbort, NotAvailable) as lacking:
             raise NotAvailable(
                 "this command needs set-points for d and q, and a recorder at loop rate: this drive lacks them",
-                where=abort.where,
+                where=lacking.where,
                 likely="a drive with fixed firmware",
                 hint="`pmsmtool commission` runs every stage that this drive allows, `pmsmtool caps` lists what it has",
-            ) from abort
+            ) from lacking
         check_motion(drive.node.map, drive.identity)
         yield drive
         drive.close()

@@ -284,6 +284,10 @@ def test_a_maker_whom_no_map_names_is_not_told_of_another_map(tool: Tool) -> Non
     assert "the maker's own tool" in said and "`pmsmtool restore --other-drive`" in said
     code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes", "prove", "design.toml")
     assert code == 9 and "needs set-points for d and q" in said and "`pmsmtool commission` runs every stage" in said
+    code, _, said = tool(
+        "--sim", "interior-2k2?nv=:memory:&eds=known.eds", "--yes", "prove", "design.toml", "--map", "epos4"
+    )
+    assert code == 9 and "needs set-points for d and q" in said, "it was: no object for inverter.T_s_ns"
     code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "monitor", "--for", "0.1s")
     assert code == 9 and "has none of these live quantities" in said and "param get 0x6064" in said
     code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "monitor", "-g", "speeed")
