@@ -7,6 +7,7 @@ down. The drive holds its own gains again when this ends, and the next connectio
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +22,7 @@ from pmsmtool.drive.motion_objects import allowed, speed_limits
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
-from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
+from pmsmtool.errors import IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal, SdoAbort
 from pmsmtool.flash.gain_journal import GainJournal
 from pmsmtool.flash.journal import Entry
 from pmsmtool.identification.learned_gains import Observation
@@ -232,13 +233,18 @@ def learn_speed_loop(
     entries = [Entry(g.name, g.item.index, g.item.sub, g.item.encode(g.counts)) for g in (gain, integral)]
     journal = GainJournal(drive.identity, entries)
     journal.begin()
-    with guarded(drive, envelope, say=say) as guard:
-        drive.send_samples()
-        try:
-            found = _Learner(guard, drive, journal, say).run(gain, integral)
-        finally:
-            guard.stop()
-            drive.end_samples()
+    try:
+        with guarded(drive, envelope, say=say) as guard:
+            drive.send_samples()
+            try:
+                found = _Learner(guard, drive, journal, say).run(gain, integral)
+            finally:
+                guard.stop()
+                drive.end_samples()
+    except PmsmtoolError:
+        with contextlib.suppress(PmsmtoolError):  # what is not back stays in the journal
+            journal.end(node)
+        raise
     journal.end(node)
     return found
 

@@ -19,7 +19,7 @@ from pmsmtool.drive.speed_loop_drive import Oscillation, SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.measured_rows import MeasuredRow, with_measured
 from pmsmtool.drive_maps.shipped_maps import load_family
-from pmsmtool.errors import LimitExceeded, SafetyRefusal
+from pmsmtool.errors import DriveFault, LimitExceeded, SafetyRefusal
 from pmsmtool.flash.gain_journal import any_left
 from pmsmtool.identification.speed_loop_response import SpeedLoop
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
@@ -167,6 +167,25 @@ def test_killed_with_a_changed_gain_the_next_connection_restores(
     bench.holder.wait(1.0)
     code, _, said = tool("--sim", bench.channel, "info")
     assert "restored" in said and bench.counts() == before and not any_left()
+
+
+@pytest.mark.chain
+def test_a_run_that_ends_with_an_error_leaves_no_journal(
+    bench: Bench, tool: Tool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gains were back, and the journal refused every later command once the drive was set up anew (exit code 5)."""
+    before, change = bench.counts(), GuardedDrive.change
+
+    def fails(self: GuardedDrive, item: Any, data: bytes) -> None:
+        change(self, item, data)
+        raise DriveFault("the drive left operation during a measurement")
+
+    loop = SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02, 1.0)
+    monkeypatch.setattr(learn_gains, "fit_speed_loop", lambda *arguments: loop)
+    monkeypatch.setattr(learn_gains, "PATTERN", learn_gains.PATTERN[:18])
+    monkeypatch.setattr(GuardedDrive, "change", fails)
+    code, _, said = bench.learn(tool)
+    assert code == 4 and "left operation" in said and bench.counts() == before and not any_left()
 
 
 def test_an_oscillation_trips() -> None:
