@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map
+from pmsmtool.cli.drive_access import OWN_FAMILY, WHOLE_SET_S, map_of_drive, map_option, open_node
 from pmsmtool.cli.options import FILE, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
@@ -53,7 +53,8 @@ def backup_command(
         raise ConfigError("--eds saves bytes, --map values", hint="give one of them")
     listed = None if eds is None else _listed(eds)
     left_out: dict[str, str] = {}
-    with open_node(bus, read_map(map_file) if listed is None else None, within_s=WHOLE_SET_S) as node:
+    drive_map = map_of_drive(bus, map_file, OWN_FAMILY) if listed is None else None
+    with open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
 
         def progress(done: int, total: int) -> None:
             out.status(f"{done}/{total}")

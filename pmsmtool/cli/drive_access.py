@@ -120,11 +120,6 @@ def open_node(
     ----------
     within_s : float, optional
         What all transfers may take together, of a command that only reads.
-
-    Raises
-    ------
-    ConfigError
-        The map is the default one, and the drive is of another family that is known.
     """
     from pmsmtool.drive.drive_node import DriveNode
 
@@ -133,27 +128,8 @@ def open_node(
         node = DriveNode(connection, claimed_node(connection, bus.node), drive_map=drive_map)
         if within_s is not None:
             node.sdo.finish_within(within_s - (connection.clock.now() - began_s))
-        if drive_map is not None and drive_map.name == OWN_FAMILY:
-            refuse_another_family(node)
         yield node
         node.close()
-
-
-def refuse_another_family(node: DriveNode) -> None:
-    """Say which map a known drive needs, instead of failing at its first object; raises ``ConfigError``."""
-    from pmsmtool.drive_maps.shipped_maps import family_of
-
-    shown = _vendor_product(node)
-    if shown is None:
-        return
-    vendor, product = shown
-    family = None if node.map.is_for(vendor, product) else family_of(vendor, product)
-    if family is not None:
-        raise ConfigError(
-            f"this drive is of family {family.name!r}, the map is {node.map.name!r}",
-            where=f"node {node.node}, 0x1018",
-            hint=f"add --map {family.name}",
-        )
 
 
 def _vendor_product(node: DriveNode) -> tuple[int, int] | None:

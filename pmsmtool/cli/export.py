@@ -94,14 +94,16 @@ def dcf_command(design: Path, into: Path | None, node_id: int, map_file: Path | 
     """Write a device configuration file (CiA 306)."""
     from pmsmtool.commissioning.export import dcf_file
     from pmsmtool.drive_maps.eds import parse_eds
-    from pmsmtool.drive_maps.sheet_check import other_identity
+    from pmsmtool.drive_maps.sheet_check import family_of_sheet, other_identity
 
     drive_map = read_map(map_file)
     if into is None and map_file is not None:
         raise click.UsageError("--map needs --into: the data sheet of that drive")
     base = None if into is None else read_bytes(into, hint="give with --into an EDS or DCF that you may read")
     if base is not None:
-        differs = other_identity(parse_eds(base, str(into)), drive_map)
+        sheet = parse_eds(base, str(into))
+        drive_map = (map_file is None and family_of_sheet(sheet)) or drive_map
+        differs = other_identity(sheet, drive_map)
         if differs:
             out.warn(f"{into}: {differs}")
     wanted = _parameters(design, drive_map, out)

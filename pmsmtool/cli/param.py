@@ -14,8 +14,10 @@ import click
 
 from pmsmtool.cli.drive_access import (
     LOOKING_S,
+    OWN_FAMILY,
     WHOLE_SET_S,
     difference_of_drive,
+    map_of_drive,
     map_option,
     open_node,
     read_map,
@@ -55,10 +57,10 @@ def get_command(bus: BusOptions, out: Output, names: tuple[str, ...], map_file: 
     An object given by its address is read as bytes where the map is not this drive's. What cannot be read is named in
     its row; the exit code is that of the worst.
     """
-    drive_map = read_map(map_file)
-    wanted = [entry for name in names for entry in _resolve(name, drive_map)]
     addresses = [text for text in names if _ADDRESS.fullmatch(text)]
     of_no_map = len(addresses) == len(names) and map_file is None
+    drive_map = read_map(None) if of_no_map else map_of_drive(bus, map_file, OWN_FAMILY)
+    wanted = [entry for name in names for entry in _resolve(name, drive_map)]
     with open_node(bus, None if of_no_map else drive_map, within_s=LOOKING_S) as node:
         if difference_of_drive(node):
             raw = {_resolve(text, drive_map)[0][1] for text in addresses}
@@ -108,7 +110,7 @@ def set_command(
     from pmsmtool.flash.download import set_named
     from pmsmtool.params.parameter_set import ParameterSet
 
-    drive_map = read_map(map_file)
+    drive_map = map_of_drive(bus, map_file, OWN_FAMILY)
     values: dict[str, float] = {}
     for assignment in assignments:
         values |= _assignment(assignment, drive_map)
@@ -129,7 +131,7 @@ def dump_command(bus: BusOptions, out: Output, everything: bool, path: Path | No
     """Print the drive's parameters as a parameter set that flash-params takes."""
     from pmsmtool.files import write_file
 
-    with open_node(bus, read_map(map_file), within_s=WHOLE_SET_S) as node:
+    with open_node(bus, map_of_drive(bus, map_file, OWN_FAMILY), within_s=WHOLE_SET_S) as node:
         warn_of_other_drive(node, out)
         _say_staged(node, out)
         held = _device_set(node)
@@ -160,7 +162,7 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
     from pmsmtool.errors import CheckFailed
     from pmsmtool.params.parameter_set import compare
 
-    drive_map = read_map(map_file)
+    drive_map = map_of_drive(bus, map_file, OWN_FAMILY) if "device" in (old, new) else read_map(map_file)
     if "device" in (old, new):
         with open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
             warn_of_other_drive(node, out)
@@ -170,12 +172,11 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
         sets = [_side(side, drive_map) for side in (old, new)]
     first, second = (drive_map.quantised(given) for given in sets)
     differences = compare(first, second, common_only=True)
-    rows = [_difference_cells(d) for d in differences]
-    heads = ("name", old, new, "unit", "change")
     lacking = drive_map.not_written(dict.fromkeys(name for side in sets for name in (*side.values, *side.tables)))
     equal = [name for name in first.values if name in second.values and first.values[name] == second.values[name]]
     facts = {"old": old, "new": new, "differences": differences, "equal": equal, "not_written": lacking}
-    out.result("param-diff", facts, lambda: table(heads, rows))
+    rows = [_difference_cells(d) for d in differences]
+    out.result("param-diff", facts, lambda: table(("name", old, new, "unit", "change"), rows))
     out.note(f"{counted(len(differences), 'difference')} among what both hold")
     for name, why in lacking.items():
         (out.note if name in drive_map.left_out else out.detail)(f"not compared, not written: {name}: {why}")

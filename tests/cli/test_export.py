@@ -32,6 +32,7 @@ from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.resources import data_folder
 from tests.concise_dcf import read_concise
 from tests.firmware.exported_image import image_of_json
+from tests.foreign.data_sheets import epos4, write_eds
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
@@ -180,6 +181,16 @@ def test_a_users_file_keeps_its_other_bytes(folder: Path, tmp_path: Path) -> Non
     added = [line for line in lines if line not in set(theirs.split(b"\r\n"))]
     assert lines[0] == b"; our own line"
     assert all(line.startswith((b"ParameterValue=", b"[DeviceComissioning]", b"Node")) for line in added)
+
+
+@pytest.mark.chain
+def test_the_map_of_a_data_sheet_is_that_of_its_family(folder: Path, tmp_path: Path) -> None:
+    """Without --map a hundred rows of the reference drive's map were held against an EPOS4's file, exit 2."""
+    sheet = write_eds(tmp_path / "theirs.eds", epos4())
+    export("dcf", folder, "--into", sheet, "-o", tmp_path / "chosen.dcf")
+    export("dcf", folder, "--into", sheet, "--map", "epos4", "-o", tmp_path / "given.dcf")
+    written = (tmp_path / "chosen.dcf").read_bytes()
+    assert written == (tmp_path / "given.dcf").read_bytes() and b"ParameterValue=" in written
 
 
 BAD = {

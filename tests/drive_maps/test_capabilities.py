@@ -248,11 +248,13 @@ def test_flash_params_takes_the_map_of_the_drives_family(tmp_path: Path) -> None
     assert re.search(r"current.K_p_q_v_per_a .*-> +144 V/A", chosen.stdout)
 
 
-def test_a_known_drive_is_told_its_map() -> None:
-    outcome = run("--sim", CHANNEL + "&drive=epos4", "param", "get", "current.*")
-    assert isinstance(outcome.exception, ConfigError) and outcome.exception.hint == "add --map epos4"
-    outcome = run("--sim", CHANNEL + "&drive=epos4", "param", "get", "current.*", "--map", "epos4")
-    assert outcome.exit_code == 0 and "0x30A0:01" in outcome.stdout
+def test_a_known_drive_is_read_through_its_familys_map(tmp_path: Path) -> None:
+    for more in ((), ("--map", "epos4")):
+        outcome = run("--sim", CHANNEL + "&drive=epos4", "param", "get", "current.*", *more)
+        assert outcome.exit_code == 0 and "0x30A0:01" in outcome.stdout
+    outcome = run("--sim", CHANNEL + "&drive=epos4", "param", "diff", "default", "device")
+    assert outcome.exit_code == 0 and "motor.pole_pairs" in outcome.stdout
+    assert run("--sim", CHANNEL + "&drive=epos4", "backup", "-o", str(tmp_path / "held.json")).exit_code == 0
     outcome = run("--sim", CHANNEL + "&drive=epos4", "param", "get", "current.*", "--map", "epos5")
     assert isinstance(outcome.exception, ConfigError)
 
