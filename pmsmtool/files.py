@@ -153,7 +153,7 @@ def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: 
     except (OSError, ValueError) as error:
         reason = (error.strerror if isinstance(error, OSError) else "") or error
         likely = "a read-only or full disk"
-        if isinstance(error, FileNotFoundError):
+        if isinstance(error, FileNotFoundError) and not path.parent.is_dir():
             likely = f"there is no folder {path.parent}"
         elif isinstance(error, PermissionError):
             likely = "you may not write there, or another program holds the file"

@@ -3,6 +3,7 @@
 
 import os
 import secrets
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -90,6 +91,13 @@ def test_a_missing_folder_is_no_full_disk(tmp_path):
     with pytest.raises(ConfigError) as caught:
         write_file(tmp_path / "none" / "out", b"")
     assert caught.value.likely == f"there is no folder {tmp_path / 'none'}"
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self"), reason="no folder here that takes no files")
+def test_a_folder_that_takes_no_files_is_not_said_to_be_missing():
+    with pytest.raises(ConfigError) as caught:
+        write_file(Path("/proc/out"), b"")
+    assert caught.value.likely == "a read-only or full disk"
 
 
 def test_another_encoding_is_named(tmp_path):
