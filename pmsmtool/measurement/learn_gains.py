@@ -344,12 +344,14 @@ class _Learner:
         self, what: str, step: float, counts: Mapping[str, int], first: SpeedLoop | None = None
     ) -> Observation:
         record = self._record(step, PATTERN)
+        self.guard.stop()  # a fit takes longer than the drive waits for a heartbeat
         loop = fit_speed_loop(record, first)
         margin = math.degrees(phase_margin_rad(loop.K_p_per_J, loop.K_i_per_J, loop.lag_s))
         self.say(
             f"{what}: K_p/J {loop.K_p_per_J:.4g} 1/s, K_i/K_p {loop.K_i_per_J / loop.K_p_per_J:.3g} 1/s, "
             f"phase margin about {margin:.0f} deg"
         )
+        self.guard.enable()
         return Observation(counts[GAIN], counts[INTEGRAL], loop)
 
     def _changed(
