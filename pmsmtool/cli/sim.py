@@ -97,7 +97,7 @@ def serve_command(
     line = build_line(channel, instant=True)
     if scenario is not None:
         _operate(line, channel, out)
-    server = SocketcandServer(line, host, port, speed=speed, say=out.note)
+    server = SocketcandServer(line, host, port, speed=speed, damaged=channel.terminator == "missing", say=out.note)
     ids = [node.node_id for node in line.nodes]
     data = {"interface": "socketcand", "host": host, "port": server.port, "profile": channel.name, "node_ids": ids}
     out.result("sim-serve", data, [f"socketcand {host}:{server.port}"])

@@ -267,11 +267,6 @@ def build_line(
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.sim.simulated_machine import with_simulation
 
-    if instant and channel.terminator == "missing":
-        raise ConfigError(
-            "a served bus has no wire that lacks a terminator", where=f"channel {channel.name}",
-            hint="rehearse it without `sim serve`: --sim 'NAME?terminator=missing'",
-        )  # fmt: skip
     first = DEFAULT_NODE_ID if channel.node is None else channel.node
     if first != UNCONFIGURED and first + channel.nodes - 1 > LARGEST_NODE_ID:
         raise ConfigError(

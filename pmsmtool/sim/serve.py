@@ -47,6 +47,8 @@ _HANDSHAKE_S = 10.0
 # A client that is not in raw mode by then is dropped.
 _LONGEST_COMMAND = 200
 _GREETING, _OPENED, _RAW = range(3)
+_DAMAGED = 0x2000_0008
+# An error frame of SocketCAN: a violation of the protocol (CAN_ERR_FLAG, CAN_ERR_PROT of linux/can/error.h).
 
 
 @dataclass(slots=True, eq=False)
@@ -70,6 +72,9 @@ class Client:
     def hear(self, frame: Frame, own: bool) -> None:
         """Queue a frame for the program; remote frames have no place in the protocol."""
         if frame.flags & REMOTE or len(self.outgoing) > _BACKLOG_LIMIT:
+            return
+        if self.server.damaged:
+            self.outgoing += f"< error {_DAMAGED:08X} {self.server.stamp():.6f} >".encode("ascii")
             return
         identifier = f"{frame.can_id:08X}" if frame.flags & EXTENDED else f"{frame.can_id:03X}"
         self.outgoing += f"< frame {identifier} {self.server.stamp():.6f} {frame.data.hex()} >".encode("ascii")
@@ -143,6 +148,8 @@ class SocketcandServer:
         Where to listen; port 0 chooses a free one.
     speed : float
         Virtual seconds per second of the wall clock; fewer where the computer cannot keep up.
+    damaged : bool
+        Whether every frame reaches the programs as an error frame: a terminating resistor is missing.
     say : callable
         Told one line when the drives' time stood still for ``WORTH_SAYING_S`` or more.
 
@@ -159,9 +166,11 @@ class SocketcandServer:
         port: int = DEFAULT_PORT,
         *,
         speed: float = 1.0,
+        damaged: bool = False,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         self.line = line
+        self.damaged = damaged
         self._say = say
         self._speed = speed
         self._selector = selectors.DefaultSelector()

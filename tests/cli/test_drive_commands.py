@@ -138,8 +138,6 @@ def test_doctor_names_a_missing_terminator(tool: Tool) -> None:
     assert "120 ohm is one missing resistor" in out and "--find-bitrate" not in err
     code, _, err = tool("info", channel=bare)
     assert code == 3 and "a bus without termination" in err
-    code, _, err = tool("sim", "serve", bare)
-    assert code == 2 and "a served bus has no wire" in err
     code, _, err = tool("info", channel="interior-2k2?terminator=mising")
     assert code == 2 and "must be one of fitted, missing" in err
 

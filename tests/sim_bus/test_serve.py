@@ -37,8 +37,9 @@ ROOT = Path(__file__).parents[2]
 @contextlib.contextmanager
 def served(channel: str = "interior-2k2?nv=:memory:", *, speed: float = 1.0, paced: bool = False) -> Iterator[int]:
     """Serve simple drives in a thread; yields the port."""
-    line = build_line(parse_channel(channel), instant=not paced, make_core=lambda machine_file, seed: SimpleCore())
-    server = SocketcandServer(line, port=0, speed=speed)
+    parsed = parse_channel(channel)
+    line = build_line(parsed, instant=not paced, make_core=lambda machine_file, seed: SimpleCore())
+    server = SocketcandServer(line, port=0, speed=speed, damaged=parsed.terminator == "missing")
     end = threading.Event()
     thread = threading.Thread(target=server.serve, args=(end.is_set,))
     thread.start()
@@ -78,6 +79,14 @@ def test_a_stock_bus_asks_and_is_answered() -> None:
     with served() as port, joined(port) as bus:
         bus.send(message(0x601, READ_SERIAL))
         assert wait_for(bus, 0x581).data[:4] == bytes.fromhex("43181004")
+
+
+def test_a_served_bus_without_a_terminator_has_error_frames_alone() -> None:
+    """Before, it was refused: the fault could be rehearsed in one process only."""
+    with served("interior-2k2?nv=:memory:&terminator=missing") as port, joined(port) as bus:
+        bus.send(message(0x601, READ_SERIAL))
+        heard = bus.recv(2.0)
+        assert heard is not None and heard.is_error_frame
 
 
 def test_time_follows_the_wall_clock_times_speed() -> None:
