@@ -7,9 +7,10 @@ import math
 from collections.abc import Callable, Generator
 
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.objects import LIVE
+from pmsmtool.drive.objects import IDENTITY, LIVE, SET_SIGNATURE, DriveObject
 from pmsmtool.drive.process_data import live_values
 from pmsmtool.errors import DriveTimeout, NotAvailable
+from pmsmtool.params.catalogue import layout_signature
 
 SILENT_S = 1.0
 """A drive that was told to send by a timer and sends nothing for this long, and for three periods, is lost."""
@@ -45,7 +46,8 @@ class Column:
 
 def available(node: DriveNode, wanted: Callable[[str], object]) -> list[str]:
     """Return the names of the live quantities that are wanted and that the drive has; raises ``NotAvailable``."""
-    names = [name for name, item in LIVE.items() if wanted(name) and node.has(item.index, item.sub)]
+    own = _is_reference(node)  # of another maker's drive the same objects are something else
+    names = [name for name, item in LIVE.items() if own and wanted(name) and node.has(item.index, item.sub)]
     if names:
         return names
     if any(map(wanted, LIVE)):
@@ -55,6 +57,12 @@ def available(node: DriveNode, wanted: Callable[[str], object]) -> list[str]:
             hint="`pmsmtool param get 0x6064 0x6077 0x6078` reads what CiA 402 knows, `monitor --log` what it sends",
         )  # fmt: skip
     raise NotAvailable("there is no live quantity of that name", hint=f"there are {', '.join(LIVE)}")
+
+
+def _is_reference(node: DriveNode) -> bool:
+    """Return whether a drive names itself the reference drive, or holds its parameter set under another name."""
+    named = (int(node.held(DriveObject(IDENTITY, sub, "I")) or 0) for sub in (1, 2))
+    return node.map.is_for(*named) or node.held(SET_SIGNATURE) == layout_signature()
 
 
 def readings(node: DriveNode, names: list[str], period_s: float, seconds: float | None) -> Readings:

@@ -13,7 +13,10 @@ import pytest
 
 from pmsmtool.drive import live_readings
 from pmsmtool.drive.live_readings import Column, available, readings, sent
+from pmsmtool.drive.objects import IDENTITY, DriveObject
+from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, reference_map
 from pmsmtool.errors import DriveTimeout, NotAvailable
+from pmsmtool.params.catalogue import layout_signature
 
 NAMES = ["i_d_a", "i_q_a"]
 GET_S = 0.01
@@ -22,8 +25,9 @@ GET_S = 0.01
 class Node:
     """A node whose transfers take 10 ms."""
 
-    def __init__(self) -> None:
-        self.node = 1
+    def __init__(self, vendor: int = REFERENCE_VENDOR, signature: int = 0) -> None:
+        self.node, self.map = 1, reference_map()
+        self.numbers = {IDENTITY: {1: vendor, 2: REFERENCE_PRODUCT}, 0x2000: {2: signature}}
         self.t_s = 100.0
         self.connection = self.clock = self.supervision = self
         self.checks = 0
@@ -41,6 +45,9 @@ class Node:
 
     def check(self) -> None:
         self.checks += 1
+
+    def held(self, item: DriveObject) -> float:
+        return self.numbers[item.index][item.sub]
 
     def has(self, index: int, sub: int) -> bool:
         return True
@@ -73,6 +80,13 @@ def test_a_quantity_must_be_wanted_and_there() -> None:
     assert available(Node(), lambda name: name in NAMES) == NAMES  # type: ignore[arg-type]
     with pytest.raises(NotAvailable):
         available(Node(), lambda name: False)  # type: ignore[arg-type]
+
+
+def test_the_objects_of_another_makers_drive_are_no_live_quantities() -> None:
+    """Of a firmware with this program's core they are, whoever sells it."""
+    assert available(Node(0x6A, layout_signature()), lambda name: name in NAMES) == NAMES  # type: ignore[arg-type]
+    with pytest.raises(NotAvailable, match="none of these live quantities"):
+        available(Node(0x6A), lambda name: name in NAMES)  # type: ignore[arg-type]
 
 
 def silent_after(node: Node, sets: int, monkeypatch: pytest.MonkeyPatch) -> None:

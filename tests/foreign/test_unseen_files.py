@@ -290,6 +290,9 @@ def test_a_maker_whom_no_map_names_is_not_told_of_another_map(tool: Tool) -> Non
     assert code == 9 and "needs set-points for d and q" in said, "it was: no object for inverter.T_s_ns"
     code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "monitor", "--for", "0.1s")
     assert code == 9 and "has none of these live quantities" in said and "param get 0x6064" in said
+    write_eds(Path("y.eds"), unknown("0x225", (0x2070, 1, "U16", "rw", "15"), (0x2070, 2, "U32", "rw", "0x42280000")))
+    code, printed, said = tool("--sim", "interior-2k2?nv=:memory:&eds=y.eds", "monitor", "--for", "0.1s")
+    assert code == 9 and "42" not in printed and "has none of these live quantities" in said, "its inputs, as 42 A"
     code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "monitor", "-g", "speeed")
     assert code == 9 and "there is no live quantity of that name" in said and "theta_m_rad" in said
     code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=known.eds", "--yes", "flash-params", "design.toml")
