@@ -58,8 +58,9 @@ class Trace(Summarised):
     def summary(self) -> Summary:
         """Return the range of each signal."""
         span = f" from {self.t_s[0]:.6g} to {self.t_s[-1]:.6g} s" if len(self) else ""
+        units = {name: "-" if unit == "1" else unit for name, unit in self.units.items()}  # "1" looks like a value
         rows = [
-            (name, self.units[name], *((f"{values.min():.5g}", f"{values.max():.5g}") if len(self) else ("", "")))
+            (name, units[name], *((f"{values.min():.5g}", f"{values.max():.5g}") if len(self) else ("", "")))
             for name, values in self.signals.items()
         ]
         return Summary(f"trace: {len(self)} rows{span}", ("signal", "unit", "least", "largest"), rows)

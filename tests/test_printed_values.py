@@ -97,6 +97,12 @@ def test_letters_of_html_in_a_name_are_shown_as_they_are() -> None:
     assert "&lt;b&gt;</td><td>A&amp;V" in trace._repr_html_() and "<b> A&V" in shown(trace)
 
 
+def test_a_signal_without_a_unit_shows_no_number_in_its_place() -> None:
+    """Before, ``flags  1  0  0`` was read as a range that begins at 1."""
+    trace = pmsmtool.Trace(np.array([0.0, 1.0]), {"flags": np.zeros(2)}, {"flags": "1"}, {})
+    assert shown(trace).endswith("flags - 0 0")
+
+
 def test_a_signal_that_is_not_there_names_the_nearest() -> None:
     trace = pmsmtool.Trace(np.zeros(1), {"i_q_a": np.zeros(1)}, {"i_q_a": "A"})
     with pytest.raises(KeyError, match="no signal 'iq_a'; did you mean i_q_a"):
