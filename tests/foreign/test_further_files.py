@@ -116,11 +116,12 @@ def test_a_drive_without_torque_mode_is_led_to_moves(tool: Tool, rows: tuple[Row
 
 @pytest.mark.parametrize(("rows", "next_step"), [(epos4(), "or --map epos4"), (unknown(), "its map with --map")])
 def test_the_file_of_another_drive_is_refused_in_a_few_lines(tool: Tool, rows: tuple[Row, ...], next_step: str) -> None:
-    """Without --map the map is the reference drive's: its hundred objects were listed one by one."""
+    """The hundred objects of the reference drive were listed one by one."""
     write_eds(Path("x.eds"), rows)
     profile = str(machine_path("interior-2k2"))
     assert tool("tune", profile, "-o", "design.toml")[0] == 0
-    code, _, said = tool("export", "dcf", "design.toml", "--into", "x.eds", "-o", "x.dcf")
+    given = ("--into", "x.eds", "--map", "pmsmsim", "-o", "x.dcf")
+    code, _, said = tool("export", "dcf", "design.toml", *given)
     assert code == 2 and next_step in said and "more" in said and len(said.splitlines()) < 20, said
 
 
