@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -370,8 +371,11 @@ LENT = Identity(NODE, 0xA51, 2, 3, 417, "", "", "")
 
 
 @pytest.mark.parametrize("serial", [417, 0])
-def test_what_a_killed_run_left_comes_back_with_the_next_command(serial: int) -> None:
+def test_what_a_killed_run_left_comes_back_with_the_next_command(
+    serial: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The next download stored the lowered limits of a killed `identify` with its own values, and exited with 0."""
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path))  # other tests leave records of drives that fell silent
     killed, identity = {A: 5, B: 6, objects.MODE: 3, objects.STATUSWORD: 0x40}, replace(LENT, serial=serial)
     with node_of(killed, GENERIC) as (table, node):
         changed = changed_of(node)
