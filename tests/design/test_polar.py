@@ -144,7 +144,7 @@ def test_cdm_gains_are_continuous_where_the_d_axis_is_slowed() -> None:
     near_zero = polar.cdm_gains(SET_A, 0.0, 0.0, V_MAX, T_s, tau)
     assert abs(near_zero.K_P12) * POWER_TO_PEAK == pytest.approx(2.7, abs=0.05)
     polynomial = np.array([SET_A.L_s_h, SET_A.R_s_ohm + above.K_P21, above.K_I21]) / SET_A.L_s_h
-    assert np.roots(polynomial)[0].real == pytest.approx(-1250, rel=1e-6)
+    assert polynomial == pytest.approx([1.0, 2.5 / tau, 2.5 / tau**2])  # (24), gamma = 2.5
 
 
 def test_an_interior_machine_is_refused_with_the_number() -> None:
