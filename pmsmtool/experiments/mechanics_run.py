@@ -42,6 +42,9 @@ follows. On a gimbal motor 0.05 A of 1.2 A turned the shaft by six periods of it
 STRONGER_TRIES = 3
 LEFT_LEAST = 0.5
 """Speed at the begin of a coasting, of that at the end of the push, below which most of it was over before."""
+SHORTER = 3.0
+"""Current of the pushes of such a shaft, of the planned one, which are shorter by as much: cogging and friction that
+stop it soon are then a third of the push."""
 CURRENT_OFF = 0.15
 """Current, of the push's, below which it is over. What flows then is known, and counts as a torque: a loop whose
 integral follows the falling back-EMF lets 8 % flow on a light shaft until friction has stopped it."""
@@ -126,10 +129,12 @@ def push_and_coast(drive: Drive, plan: MechanicsPlan, abort_speed_rad_s: float, 
         first = _push(drive, plan.i_q_a, plan.unit_s, plan.rows, abort_speed_rad_s)
         coasting = _coast(drive, plan)
     if abs(_speed(coasting, first_rows=True)) < LEFT_LEAST * abs(_speed(first)):
+        times = min(SHORTER, plan.i_most_a / plan.i_q_a)
+        current, push_s = times * plan.i_q_a, plan.unit_s / times
         for sign in (1.0, -1.0):
             drive.enable()
-            whole = _push(drive, sign * plan.i_q_a, plan.unit_s, plan.rows, abort_speed_rad_s, COAST_LEAST_S)
-            for part in _parts(whole, sign * plan.i_q_a, plan.unit_s):
+            whole = _push(drive, sign * current, push_s, plan.rows, abort_speed_rad_s, COAST_LEAST_S)
+            for part in _parts(whole, sign * current, push_s):
                 keep(part)
         drive.disable()
         return

@@ -156,7 +156,9 @@ def cogging_of(traces: Mapping[str, Trace], result: Evaluation) -> Cogging | Non
     coasted = [trace for trace in traces.values() if trace.meta.get(POWERED)]
     damped = max((coasting_torque(trace, torque) for trace in coasted), default=0.0) / J.value
     shown = [replace(h, std=math.hypot(h.std, damped)) for h in harmonics.acceleration_rad_s2]
-    harmonics = replace(harmonics, acceleration_rad_s2=tuple(shown))
+    if not (clear := tuple(h for h in shown if h.amplitude > SURE * h.std)):
+        return None
+    harmonics = replace(harmonics, acceleration_rad_s2=clear)
     how = f"coasting through {harmonics.turns:.3g} turns and more each way"
     return Cogging(harmonics, J, highest, math.inf, how)
 
