@@ -199,14 +199,16 @@ def estimate_inductances(
         condition_gate(fit.condition, f"L_{axis} and the delay", f"inductance, {axis} axis")
         cross[axis] = _cross_response(shots[axis][0], fit, noise.sigma_a)
     misfit, apart_s = dict.fromkeys(fits, 0.0), 0.0
-    if instant is not None and _contradicted(fits, instant):
+    if instant is not None and any(
+        not instant.knows(f.delay) or abs(instant.distance(f.delay, f.lag_s)) > INSTANT_LIMIT for f in fits.values()
+    ):
         # what a turning machine shows is then not the instant alone, and square waves alone may err as well
         alone = _fitted(shots, noise.sigma_a, R_ohm, motion, None)
         misfit = {axis: abs(alone[axis].L_h - fit.L_h) for axis, fit in fits.items()}
         apart_s = max(abs(instant.distance(fit.delay, fit.lag_s)) for fit in fits.values()) * instant.std_s
         if any("eddy" in fit.effects for fit in alone.values()):
             # iron loss turns the voltage of a turning machine, as an instant would; what cannot follow says nothing
-            misfit = {axis: change * (fits[axis].chi2 <= CHI2_REFUSE) for axis, change in misfit.items()}
+            misfit = {a: m * (fits[a].chi2 <= CHI2_REFUSE and instant.knows(fits[a].delay)) for a, m in misfit.items()}
             fits, instant = alone, None
     widen = {axis: _widening(fit, shots[axis], noise.sigma_a, f"inductance, {axis} axis") for axis, fit in fits.items()}
     misfit = {axis: math.hypot(misfit[axis], widen[axis][2] * fit.L_h) for axis, fit in fits.items()}
@@ -258,7 +260,6 @@ def estimate_inductances(
             axis: replace(L, value=L.value + half_apart, systematic=L.systematic + half_apart)
             for axis, L in estimates.items()
         }
-    warned = bool(dependent) or any(verdict is Verdict.WARN for verdict, *_ in widen.values())
     return InductanceResult(
         L_d=estimates["d"],
         L_q=estimates["q"],
@@ -267,7 +268,7 @@ def estimate_inductances(
         lag_s=0.5 * (fits["d"].lag_s + fits["q"].lag_s),
         frequency_dependent=dependent,
         axis_angle_rad=angle,
-        verdict=Verdict.WARN if warned else Verdict.PASS,
+        verdict=Verdict.WARN if dependent or any(v is Verdict.WARN for v, *_ in widen.values()) else Verdict.PASS,
         # the q axis was fitted with what the d axis says
         sampling=None if instant is None else instant.sampling(fits["q"].delay, fits["q"].lag_s),
         samplings=()
@@ -355,11 +356,6 @@ def _eddy_std(fit: AxisFit) -> float:
     if "eddy" not in fit.effects:
         return 0.0
     return EDDY_STD + EDDY_MISFIT_STD * math.sqrt(max(0.0, fit.chi2 - 1.0))
-
-
-def _contradicted(fits: Mapping[str, AxisFit], instant: ShownInstant) -> bool:
-    """Whether square waves contradict what the turning machine shows of the sampling instant: iron loss does that."""
-    return any(abs(instant.distance(fit.delay, fit.lag_s)) > INSTANT_LIMIT for fit in fits.values())
 
 
 def _widening(fit: AxisFit, shots: Sequence[Shot], sigma_a: float, stage: str) -> tuple[Verdict, float, float]:

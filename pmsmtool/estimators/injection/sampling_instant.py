@@ -153,6 +153,10 @@ class ShownInstant:
         late = (self.computation_periods - delay) * self.period_s
         return Sampling(late + 0.5 * self.dead_time_s, lag_s)
 
+    def knows(self, delay: float) -> bool:
+        """Whether a delay (T_s) stands for an instant of the prediction, or for one at most an interval beside it."""
+        return abs(_place(INSTANTS, self.sampling(delay, 0.0).instant_s / self.period_s)[1] - 0.5) <= 1.0
+
     def distance(self, delay: float, lag_s: float) -> float:
         """Whitened distance of a delay (T_s) and a lag from what is shown."""
         place = self.sampling(delay, lag_s)
