@@ -140,7 +140,7 @@ def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> 
     keys = {key for key in measured if f"{key[0]}: {key[1]}" in outside}
     only_quantities = not keys
     keys |= {key for name, q in prediction.quantities.items() if name in outside for key in q.signature}
-    cause = likely_cause(prediction, {key: measured[key] for key in sorted(keys)})
+    cause = likely_cause(prediction, {key: measured[key] for key in sorted(keys)}, measured)
     if not cause and only_quantities:  # no response alone is far enough off to tell, but what they tell together is
         cause = _cause_of_quantities(prediction, deviation)
     if not cause and any(b.ripple >= _most_ripple(b) for b in map(prediction.bands.__getitem__, keys)):
@@ -172,25 +172,38 @@ def _seen_quantity(name: str, quantity: Quantity, value: float) -> Seen:
     return Seen(name, share, f"{value:.3g}{unit}, {quantity.low:.3g} to {quantity.high:.3g} predicted")
 
 
-def likely_cause(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> str:
-    """Return the text of the fault whose signature is clearly nearest; empty when none is.
+def likely_cause(
+    prediction: Prediction, deviating: Mapping[tuple[str, str], Array], measured: Mapping[tuple[str, str], Array]
+) -> str:
+    """Return the text of the fault whose signature is clearly nearest to what deviates; empty when none is.
 
-    ``measured`` are the responses that deviate.
+    A healthy drive must not be clearly nearer to all that was ``measured``: wrong pole pairs were named where current
+    steps were off, beside a speed step as predicted.
     """
-    means = {key: prediction.bands[key].mean for key in measured}
-    stds = {key: prediction.bands[key].std for key in measured}
-    healthy = _distance(measured, means, stds)
-    scores: dict[str, float] = {}  # by text: two sizes of the same fault do not compete
-    for fault in prediction.faults.values():
-        widest = {key: np.maximum(fault.std[key], stds[key]) for key in measured}
-        distance = _distance(measured, fault.mean, widest)
-        # minus twice the log-likelihood per point: what may look like anything is not near to everything
-        score = distance + 2.0 * float(np.mean([np.mean(np.log(widest[key] / stds[key])) for key in measured]))
-        scores[fault.text] = min(score, scores.get(fault.text, math.inf))
-    nearest, *others = sorted(scores, key=lambda text: scores[text]) or [""]
+    healthy, scores = _scores(prediction, deviating)
+    texts: dict[str, str] = {}  # two sizes of the same fault do not compete
+    for name in sorted(scores, key=lambda name: scores[name]):
+        texts.setdefault(prediction.faults[name].text, name)
+    nearest, *others = texts.values() or [""]
     if not nearest or scores[nearest] > EXPLAINED * healthy:
         return ""
-    return "" if others and scores[nearest] > CLEARLY * scores[others[0]] else nearest
+    if others and scores[nearest] > CLEARLY * scores[others[0]]:
+        return ""
+    healthy, scores = _scores(prediction, measured)
+    return prediction.faults[nearest].text if healthy >= CLEARLY * scores[nearest] else ""
+
+
+def _scores(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> tuple[float, dict[str, float]]:
+    """Return how far responses are from those of a healthy drive, and from those of each fault, by its name."""
+    means = {key: prediction.bands[key].mean for key in measured}
+    stds = {key: prediction.bands[key].std for key in measured}
+    scores: dict[str, float] = {}
+    for name, fault in prediction.faults.items():
+        widest = {key: np.maximum(fault.std[key], stds[key]) for key in measured}
+        # minus twice the log-likelihood per point: what may look like anything is not near to everything
+        wider = 2.0 * float(np.mean([np.mean(np.log(widest[key] / stds[key])) for key in measured]))
+        scores[name] = _distance(measured, fault.mean, widest) + wider
+    return _distance(measured, means, stds), scores
 
 
 def _distance(

@@ -75,6 +75,17 @@ def test_the_cause_is_the_nearest_signature(wrong: dict[str, float], cause: str)
     assert named.count(cause) >= 18
 
 
+def test_a_fault_that_shows_elsewhere_is_not_the_cause_where_nothing_shows() -> None:
+    """A shaft that reached its speed was said to have wrong pole pairs, for its current steps were off."""
+    speed, noise = ("run", "omega_e_rad_s"), 0.01 * np.random.default_rng(3).standard_normal((97, ROWS))
+    fast = {KEY: responses(6, 0, gain=1.25), speed: noise[:6] + 10.0}
+    healthy = {KEY: responses(96, 0), speed: noise[1:]}
+    found = predict({"step": T_S, "run": T_S}, healthy, {KEY: 1.0, speed: 1.0}, faults={"fast": ("too much", fast)})
+    step = responses(1, 5, gain=1.25)[0]
+    for reached, cause in ((10.0, "too much"), (0.0, "")):
+        assert judge(found, {KEY: step, speed: noise[0] + reached}).cause == cause
+
+
 def test_what_looks_like_no_fault_has_no_cause() -> None:
     odd = responses(1, 9)[0]
     odd[60:] *= -1.0
