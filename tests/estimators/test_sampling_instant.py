@@ -78,7 +78,8 @@ def test_ripple_is_that_of_the_switched_legs(u_d: float, u_q: float, instant: fl
     voltage, current = (np.array([u_d]), np.array([u_q])), (np.array([4.0]), np.array([0.3]))
     found = sampled_ripple(voltage, current, MODULATION, sampling)[:, 0]
     expected = _legs_ripple(u_d, u_q, 4.0, 0.3, sampling)
-    assert found == pytest.approx(expected, abs=2e-4)  # measured 2.4e-5 A, the grid of the reference
+    # the grid of the reference: 2.4e-5 A, and 3.0e-4 where the edge of a leg is near the sample
+    assert found == pytest.approx(expected, abs=5e-4)
 
 
 @pytest.mark.chain
