@@ -204,21 +204,23 @@ def claimed_node(connection: Connection, node: int | None) -> int:
 
     chosen = choose_node(connection, node)
     claim(connection, chosen)
-    _restore_gains(connection, chosen)
+    _restore_left(connection, chosen)
     return chosen
 
 
-def _restore_gains(connection: Connection, node_id: int) -> None:
+def _restore_left(connection: Connection, node_id: int) -> None:
     """Bring back what a killed run left changed, before anything else is done with the drive."""
+    from pmsmtool.drive.changed_objects import any_lent, restore_lent
     from pmsmtool.flash.gain_journal import any_left, restore_left
 
-    if not any_left():
+    if not (any_lent() or any_left()):
         return
     from pmsmtool.drive.drive_node import DriveNode
 
     node = DriveNode(connection, node_id)
     try:
-        count = restore_left(node, node.identity())
+        identity = node.identity()
+        count = restore_lent(node, identity) + restore_left(node, identity)
     finally:
         node.close()
     if count:

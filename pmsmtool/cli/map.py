@@ -89,7 +89,7 @@ def learn_command(
     if not machine.J_kgm2 or not machine.top_rpm:
         raise ConfigError(
             "the scale of a gain rests on the inertia, and the speed limit on the largest speed",
-            where=f"{machine_path}: [machine]", hint="add J_kgm2 and n_max_rpm",
+            where=f"{machine_path}: [machine]", hint="add J_kgm2, and n_max_rpm or n_nom_rpm",
         )  # fmt: skip
     drive_map = map_of_drive(bus, map_file)
     with bus.connect() as connection:

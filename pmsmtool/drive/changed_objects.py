@@ -153,18 +153,27 @@ def any_lent() -> bool:
 
 
 def restore_lent(node: DriveNode, identity: Identity) -> int:
-    """Bring back what a killed run left changed, where the drive is off and holds it still; return how many objects."""
+    """Bring back what a killed run left changed, where the drive is off and holds it still; return how many objects.
+
+    What the drive refuses stays in the file, for the next command.
+    """
     path, count = _path_of(identity), 0
     if path is None or not path.is_file() or not is_safe(node.state()):
         return 0
+    refused: dict[str, tuple[str, str]] = {}
     with contextlib.suppress(ValueError):  # a file that is damaged says nothing
         for name, (old, new) in reversed(json.loads(read_text(path)).items()):
             index, sub = (int(part, 16) for part in name.split(":"))
-            with contextlib.suppress(SdoAbort):
+            try:
                 if old != new and node.sdo.read(index, sub).hex() == new:
                     node.sdo.download(index, sub, bytes.fromhex(old))
                     count += 1
-    path.unlink(missing_ok=True)
+            except SdoAbort:
+                refused[name] = (old, new)
+    if refused:
+        write_file(path, json.dumps(dict(reversed(refused.items()))))
+    else:
+        path.unlink(missing_ok=True)
     return count
 
 

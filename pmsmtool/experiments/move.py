@@ -16,9 +16,9 @@ HOLD_S = 0.2
 LONGEST_S = 20.0
 ARRIVED = 1e-3
 """The demand has arrived when it is this near to its end, of the way."""
-NUDGE_RAD, NUDGE_SHARE, NUDGE_COUNTS = math.radians(1.0), 0.1, 8
+TRY_RAD, TRY_SHARE, TRY_COUNTS = math.radians(1.0), 0.1, 8
 """First turn, at most and of the way, and the least of it in counts of the position."""
-NUDGE_CURRENTS, NUDGE_S, LOOK_S = (0.1, 0.3), 0.3, 0.01
+TRY_CURRENTS, TRY_S, LOOK_S = (0.1, 0.3), 0.3, 0.01
 """Currents of the first turns, of the envelope's, how long the shaft is looked at, and how often. A loop whose position
 counts the other way took a shaft of 1.6e-4 kg m2 to 2046 rpm and 8 turns at once with 6 A, before its drive tripped."""
 
@@ -37,7 +37,7 @@ def record_move(
     Returns
     -------
     Trace
-        ``theta_m_rad``, ``theta_ref_rad`` (from the start), ``i_q_a``; ``meta``: ``way_rad``.
+        ``theta_m_rad``, ``theta_ref_rad`` (from the start), ``i_q_a``; ``meta``: ``way_rad``, ``direction_seen``.
     MoveProfile or None
         What was found.
 
@@ -49,7 +49,7 @@ def record_move(
         Current, speed, travel or following error; the voltage is off.
     """
     found = None
-    _nudge(guard, drive, way_rad)
+    seen = _try_direction(guard, drive, way_rad)
     guard.enable()
     drive.begin_samples()
     try:
@@ -64,13 +64,15 @@ def record_move(
     finally:
         guard.stop()
         trace = drive.end_samples()
-    return Trace(trace.t_s, trace.signals, trace.units, {**trace.meta, "way_rad": way_rad}), found
+    return Trace(
+        trace.t_s, trace.signals, trace.units, {**trace.meta, "way_rad": way_rad, "direction_seen": seen}
+    ), found
 
 
-def _nudge(guard: GuardedDrive, drive: PositionDrive, way: float) -> None:
+def _try_direction(guard: GuardedDrive, drive: PositionDrive, way: float) -> bool:
     """Turn the shaft a little with little current, so that one that runs away from its demand does so slowly.
 
-    Where friction holds it, and where the drive's current limit cannot be lowered, this tells nothing.
+    Returns whether it was seen to turn: not where friction holds it, or where the drive's current limit stays.
 
     Raises
     ------
@@ -78,28 +80,29 @@ def _nudge(guard: GuardedDrive, drive: PositionDrive, way: float) -> None:
         It turns against the demand; the voltage is off.
     """
     clock = drive.node.connection.clock
-    nudge = max(min(NUDGE_RAD, NUDGE_SHARE * abs(way)), NUDGE_COUNTS * drive.rad_per_count)
+    least = max(min(TRY_RAD, TRY_SHARE * abs(way)), TRY_COUNTS * drive.rad_per_count)
     turned = 0.0
-    for share in NUDGE_CURRENTS:
-        if turned > 0.5 * nudge or guard.limit_current(share * guard.envelope.i_max_apk) is None:
+    for share in TRY_CURRENTS:
+        if turned > 0.5 * least or guard.limit_current(share * guard.envelope.i_max_apk) is None:
             break
         guard.enable()
         start = drive.live("theta_m_rad")
-        drive.move_to(math.copysign(nudge, way))
-        until = clock.now() + NUDGE_S
-        while clock.now() < until and abs(turned) <= 0.5 * nudge:
+        drive.move_to(math.copysign(least, way))
+        until = clock.now() + TRY_S
+        while clock.now() < until and abs(turned) <= 0.5 * least:
             guard.wait(LOOK_S)
             turned = math.copysign(1.0, way) * (drive.live("theta_m_rad") - start)
         guard.stop()
-        if turned < -0.5 * nudge:
+        if turned < -0.5 * least:
             raise SafetyRefusal(
-                f"asked to turn by {math.degrees(math.copysign(nudge, way)):.3g} deg with {share:.0%} of the current, "
+                f"asked to turn by {math.degrees(math.copysign(least, way)):.3g} deg with {share:.0%} of the current, "
                 "the shaft turned the other way",
                 where=f"node {drive.node.node}",
                 likely="the encoder counts the other way, two motor leads are swapped, or a load turns the shaft",
                 hint="the voltage is off; `pmsmtool check` looks at the encoder's sign",
             )
     guard.limit_current(guard.envelope.i_max_apk)
+    return turned > 0.5 * least
 
 
 def _arrive(guard: GuardedDrive, drive: PositionDrive, target: float, way: float) -> None:

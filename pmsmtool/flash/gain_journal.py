@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from pmsmtool.drive.changed_objects import any_lent, restore_lent
 from pmsmtool.drive.drive_node import DriveNode, is_safe, state_text
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import SafetyRefusal, VerifyMismatch
@@ -75,11 +74,11 @@ def path_of(identity: Identity) -> Path:
 
 def any_left() -> bool:
     """Whether a measurement of any drive ended without its end; looks at the disk alone."""
-    return any_lent() or any((user_folder() / "journals").glob(f"*/{FILE}"))
+    return any((user_folder() / "journals").glob(f"*/{FILE}"))
 
 
 def restore_left(node: DriveNode, identity: Identity) -> int:
-    """Bring back what a killed run left changed, its gains included; return how many objects were written.
+    """Bring back the gains that an ended measurement left changed; return how many objects were written.
 
     Raises
     ------
@@ -88,9 +87,9 @@ def restore_left(node: DriveNode, identity: Identity) -> int:
     VerifyMismatch
         An object does not hold its old value again.
     """
-    path, lent = path_of(identity), restore_lent(node, identity)
+    path = path_of(identity)
     if not path.exists():
-        return lent
+        return 0
     snapshot = read_snapshot(path)
     state = node.state()
     if not is_safe(state):
@@ -114,7 +113,7 @@ def restore_left(node: DriveNode, identity: Identity) -> int:
         node.sdo.download(entry.index, entry.sub, entry.old)
     _confirm(node, snapshot)
     path.unlink(missing_ok=True)
-    return lent + len(changed)
+    return len(changed)
 
 
 def _confirm(node: DriveNode, snapshot: Snapshot) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from pmsmtool.errors import SafetyRefusal
-from pmsmtool.experiments.move import NUDGE_CURRENTS, NUDGE_RAD, _nudge
+from pmsmtool.experiments.move import TRY_CURRENTS, TRY_RAD, _try_direction
 
 I_MAX, PER_AMPERE = 6.0, 1900.0
 WAY = 2.0 * math.pi
@@ -58,9 +58,9 @@ class Shaft:
             self.fastest, self.t = max(self.fastest, abs(self.speed)), self.t + 1e-4
 
 
-def turned(shaft: Shaft) -> Shaft:
+def turned(shaft: Shaft, *, seen: bool = False) -> Shaft:
     both: Any = shaft
-    _nudge(both, both, WAY)
+    assert _try_direction(both, both, WAY) is seen
     return shaft
 
 
@@ -73,14 +73,14 @@ def test_a_shaft_that_turns_the_other_way_is_stopped_while_it_is_slow() -> None:
 
 
 def test_a_healthy_shaft_turns_once_and_has_its_limit_again() -> None:
-    shaft = turned(Shaft(1.0, 0.12))
-    assert shaft.limits == [NUDGE_CURRENTS[0] * I_MAX, I_MAX] and not shaft.enabled
-    assert abs(shaft.angle) < 4.0 * NUDGE_RAD
+    shaft = turned(Shaft(1.0, 0.12), seen=True)
+    assert shaft.limits == [TRY_CURRENTS[0] * I_MAX, I_MAX] and not shaft.enabled
+    assert abs(shaft.angle) < 4.0 * TRY_RAD
 
 
-def test_a_shaft_that_friction_holds_says_nothing() -> None:
+def test_a_shaft_that_friction_holds_is_not_seen_to_turn() -> None:
     shaft = turned(Shaft(1.0, 5.0))
-    assert shaft.limits == [*(share * I_MAX for share in NUDGE_CURRENTS), I_MAX] and shaft.angle == 0.0
+    assert shaft.limits == [*(share * I_MAX for share in TRY_CURRENTS), I_MAX] and shaft.angle == 0.0
 
 
 def test_without_a_limit_to_lower_nothing_is_turned() -> None:

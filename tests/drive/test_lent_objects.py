@@ -398,6 +398,20 @@ def test_what_a_killed_run_left_comes_back_with_the_next_command(
         assert any_lent() and changed.restore() == 1 and not any_lent()
 
 
+def test_what_a_drive_refuses_to_take_back_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path))
+    with node_of({A: 5, B: 6, objects.STATUSWORD: 0x40}, GENERIC) as (table, node):
+        changed = changed_of(node)
+        changed.begin()
+        node.put(A, 50)
+        node.put(B, 60)
+        node.before_write = None
+        kept = table.objects.pop((0x6071, 0))
+        assert restore_lent(node, LENT) == 1 and node.get(B) == 6.0 and any_lent()
+        table.objects[0x6071, 0] = kept
+        assert restore_lent(node, LENT) == 1 and node.get(A) == 5.0 and not any_lent()
+
+
 def test_what_was_changed_comes_back_in_reverse_and_once() -> None:
     with node_of({A: 5, B: 6, objects.MODE: 3}, GENERIC) as (table, node):
         changed = changed_of(node)
