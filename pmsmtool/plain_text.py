@@ -6,7 +6,6 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
-from html import escape
 from itertools import zip_longest
 from textwrap import wrap
 from typing import NamedTuple
@@ -104,6 +103,8 @@ class Summarised(ABC):
         return "\n".join((shown.head, *table(shown.heads, shown.rows), *shown.notes))
 
     def _repr_html_(self) -> str:
+        from html import escape
+
         shown = self.summary()
         rows = [("th", shown.heads), *(("td", row) for row in shown.rows)]
         lines = ("".join(f"<{tag}>{escape(one_line(str(cell)))}</{tag}>" for cell in row) for tag, row in rows)

@@ -11,7 +11,6 @@ from typing import Any, cast
 
 from pmsmtool.commissioning.held_design import Designed, why_not_judged
 from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design, load_machine_or_design
-from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.design.lookup.design import LookupDesign, LookupRequest, design_table
 from pmsmtool.design.lookup.file import lut_values, table_csv, table_facts, table_npz
 from pmsmtool.design.lookup.loci import loci
@@ -25,7 +24,7 @@ from pmsmtool.errors import NotAvailable
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.uncontrolled_generation import Protection
-from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.params.catalogue import CATALOGUE, FIELD_WEAKENING_MODES
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage
 
 SHOWN = (
@@ -140,7 +139,7 @@ def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
     design = load_design(run.path / "design.toml")
     made = design_table(design.machine, ratings_of(design), request, design["field_weakening.margin"])
     table, error = made.table, made.error
-    used = design["field_weakening.mode"] == FIELD_WEAKENING["lookup"]
+    used = design["field_weakening.mode"] == FIELD_WEAKENING_MODES["lookup"]
     if used:
         design = with_table(design, made)
     run.save("lut.npz", table_npz(table, table_facts(table, made.stored, error), loci(table)))

@@ -46,6 +46,18 @@ _RANK = 1e-11
 """Singular values below this share of the largest belong to states a voltage does not depend on."""
 
 
+TAYLOR_TERMS = 14
+
+
+def matrix_exponential(X: Array) -> Array:
+    """Matrix exponential by its series; the entries are a period's and small."""
+    total = term = np.broadcast_to(np.eye(X.shape[-1]), X.shape).copy()
+    for k in range(1, TAYLOR_TERMS):
+        term = term @ X / k
+        total = total + term
+    return total
+
+
 @dataclass(frozen=True, slots=True)
 class PredictionModel:
     """Machine and controller as the governor predicts them (constant parameters, Euler).

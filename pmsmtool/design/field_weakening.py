@@ -20,9 +20,7 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.machine.torque import torque_per_ampere
-
-MODES: Mapping[str, int] = {"off": 0, "lookup": 1, "gradient": 2, "accelerated": 3, "uncompensated": 4}
-"""``field_weakening.mode`` of the catalogue."""
+from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES
 
 RATE_HZ = 240.0
 """Rate of the optimisation (the paper's N_FW = 50 at 12 kHz): slow against a current step, fast against the shaft."""
@@ -70,7 +68,7 @@ def design_field_weakening(source: MachineFile, rated: Ratings, mode: str, margi
     source, rated : MachineFile, Ratings
         Machine and its limits.
     mode : str
-        A key of ``MODES``.
+        A key of ``FIELD_WEAKENING_MODES``.
     margin : float
         Share of V_max kept for control.
 
@@ -79,9 +77,9 @@ def design_field_weakening(source: MachineFile, rated: Ratings, mode: str, margi
     ConfigError
         Unknown mode.
     """
-    if mode not in MODES:
+    if mode not in FIELD_WEAKENING_MODES:
         raise ConfigError(
-            f"field-weakening mode {mode!r}, allowed are {', '.join(MODES)}",
+            f"field-weakening mode {mode!r}, allowed are {', '.join(FIELD_WEAKENING_MODES)}",
             where="tune",
             hint="`pmsmtool tune --help` explains each",
         )
@@ -91,7 +89,7 @@ def design_field_weakening(source: MachineFile, rated: Ratings, mode: str, margi
     every = periods * source.inverter.T_s
     h1, h2, beta = 1.0, WEIGHT_RATIO * K_t**2, STEP / K_t**2
     values = {
-        "field_weakening.mode": DesignValue(MODES[mode], f"{mode}, as asked for"),
+        "field_weakening.mode": DesignValue(FIELD_WEAKENING_MODES[mode], f"{mode}, as asked for"),
         "field_weakening.N_fw": DesignValue(periods, f"{RATE_HZ:g} Hz"),
         "field_weakening.margin": DesignValue(margin, "asked for"),
         "field_weakening.h1": DesignValue(h1, "1"),

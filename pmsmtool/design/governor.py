@@ -13,18 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pmsmtool.design.admissible_set import Horizon, PredictionModel, StateBounds, horizon
+from pmsmtool.design.admissible_set import Horizon, PredictionModel, StateBounds, horizon, matrix_exponential
 from pmsmtool.design.design_file import DesignValue, Scalar
 from pmsmtool.design.lookup.table import RPM
 from pmsmtool.design.loops.current_loop import CurrentGains
 from pmsmtool.design.ratings import Ratings
-from pmsmtool.design.slope_response import matrix_exponential
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.params.catalogue import K_MAX_NOT_DETERMINED
-
-MODES: Mapping[str, int] = {"off": 0, "paper": 1, "line": 2, "best": 3, "linearised": 4, "observe": 5}
-"""``governor.mode`` of the catalogue."""
+from pmsmtool.params.catalogue import GOVERNOR_MODES, K_MAX_NOT_DETERMINED
 
 HEXAGON, PREDICTOR, CURRENT_ROW, PRE_PROJECTION, MINIMUM_TIME = 1, 2, 4, 8, 16
 """Bits of ``governor.options``."""
@@ -121,7 +117,7 @@ def design_governor(
     gains : mapping of str to CurrentGains
         Current controllers of axes ``d`` and ``q``.
     mode : str
-        A key of ``MODES``.
+        A key of ``GOVERNOR_MODES``.
     predictor : bool
         Whether the current controllers predict over the computation delay.
     eps : float, optional
@@ -132,9 +128,9 @@ def design_governor(
     ConfigError
         Unknown mode.
     """
-    if mode not in MODES:
+    if mode not in GOVERNOR_MODES:
         raise ConfigError(
-            f"governor mode {mode!r}, allowed are {', '.join(MODES)}",
+            f"governor mode {mode!r}, allowed are {', '.join(GOVERNOR_MODES)}",
             where="tune",
             hint="`pmsmtool tune --help` explains each",
         )
@@ -150,7 +146,7 @@ def design_governor(
     fast = V_max * source.inverter.T_s > STEERED_STEP * rated.I_max_apk * min(model.L_d, model.L_q)
     options, how = _options(mode, predictor, fast)
     values = {
-        "governor.mode": DesignValue(MODES[mode], f"{mode}, as asked for"),
+        "governor.mode": DesignValue(GOVERNOR_MODES[mode], f"{mode}, as asked for"),
         "governor.k_max": _k_max(found),
         "governor.eps": DesignValue(chosen, why),
         "governor.options": DesignValue(options, how),

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.arrays import Array
+from pmsmtool.design.admissible_set import matrix_exponential
 from pmsmtool.errors import DesignInfeasible
 
 Interval = tuple[float, float]
@@ -32,7 +33,6 @@ enough for everything that decays by a tenth in ``LOOK`` periods."""
 LOOK = 64
 LARGEST_RADIUS = 1.0 - 1e-4
 """Spectral radius from which a loop counts as unstable: a motion slower than 10 000 periods."""
-TAYLOR_TERMS = 14
 _SPEED_STEP = 1e-2
 """Step of the derivatives by speed (rad/s)."""
 ROUNDS, CONVERGED, LARGEST = 200, 1e-6, 1e9
@@ -106,15 +106,6 @@ def sampled_machine(R: Array, L_d: Array, L_q: Array, omega_e: Array, T_s: float
     turn = 0.5 * w * T_s
     rotation = np.stack([np.stack([np.cos(turn), -np.sin(turn)], -1), np.stack([np.sin(turn), np.cos(turn)], -1)], -2)
     return Sampled(X[..., :2, :2], X[..., :2, 2:4] @ rotation, X[..., :2, 4])
-
-
-def matrix_exponential(X: Array) -> Array:
-    """Matrix exponential by its series; the entries are a period's and small."""
-    total = term = np.broadcast_to(np.eye(X.shape[-1]), X.shape).copy()
-    for k in range(1, TAYLOR_TERMS):
-        term = term @ X / k
-        total = total + term
-    return total
 
 
 def steady_voltage(machine: Sampled, i: Array, psi: Array | float) -> Array:

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
-from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.design.field_weakening import design_field_weakening
 from pmsmtool.design.governor import design_governor
 from pmsmtool.design.lookup.table import RPM
@@ -39,7 +38,7 @@ from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.speed_noise import quieter, speed_noise
 from pmsmtool.machine.two_masses import shafts_of, why_slower
-from pmsmtool.params.catalogue import CATALOGUE
+from pmsmtool.params.catalogue import CATALOGUE, FIELD_WEAKENING_MODES
 from pmsmtool.params.parameter_set import SATURATION
 
 PLL_PER_PERIOD = 0.1
@@ -99,7 +98,7 @@ def tune(source: MachineFile | str | Path, request: TuneRequest | None = None) -
         ),
     ]
     tables: dict[str, tuple[float, ...]] = {}
-    if weakening.values["field_weakening.mode"].value == FIELD_WEAKENING["lookup"]:
+    if weakening.values["field_weakening.mode"].value == FIELD_WEAKENING_MODES["lookup"]:
         table, tables = _design_table(source, request, rated)
         parts.append(table)
     if source.flux_map is not None:

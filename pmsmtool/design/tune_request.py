@@ -9,14 +9,13 @@ from dataclasses import dataclass, fields
 from typing import Any, get_args
 
 from pmsmtool.design.design_file import Scalar
-from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING_MODES
-from pmsmtool.design.governor import MODES as GOVERNOR_MODES
 from pmsmtool.design.loops.current_loop import Method
 from pmsmtool.design.loops.speed_loop import SpeedMethod
 from pmsmtool.design.polar_laws import LAWS as POLAR_LAWS
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.key import Key, KeyKind, check_table
 from pmsmtool.machine.uncontrolled_generation import Protection
+from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES, GOVERNOR_MODES
 
 CONTROLLERS = ("pi", "polar")
 
@@ -59,11 +58,11 @@ class TuneRequest:
     voltage_margin : float
         Share of V_max kept for control in steady state.
     governor : str
-        Mode of the reference governor (``governor.MODES``).
+        Mode of the reference governor (``catalogue.GOVERNOR_MODES``).
     eps : float or None
         Tightening of its steady-state row.
     field_weakening : str
-        Mode of field weakening (``field_weakening.MODES``), or ``auto``: a look-up table for a machine with a flux map,
+        Mode of field weakening (``FIELD_WEAKENING_MODES``), or ``auto``: a look-up table for a machine with a flux map,
         the accelerated optimisation for a constant one; for a polar law the table where it knows more than the law
         (``polar_values.weakening_mode``).
     overspeed_protection : str or None

@@ -25,6 +25,12 @@ SCHEMA_VERSION = 1
 K_MAX_NOT_DETERMINED = 255
 """Value of ``governor.k_max`` that says: the horizon is not finitely determined."""
 
+GOVERNOR_MODES = {"off": 0, "paper": 1, "line": 2, "best": 3, "linearised": 4, "observe": 5}
+"""Names of ``governor.mode``."""
+
+FIELD_WEAKENING_MODES = {"off": 0, "lookup": 1, "gradient": 2, "accelerated": 3, "uncompensated": 4}
+"""Names of ``field_weakening.mode``."""
+
 WireType = Literal["UNSIGNED8", "UNSIGNED16", "UNSIGNED32", "REAL32"]
 
 

@@ -9,7 +9,6 @@ from itertools import pairwise
 from typing import Any
 
 from pmsmtool.design.design_file import Design
-from pmsmtool.design.field_weakening import MODES as FIELD_WEAKENING
 from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Shape
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.identification.frequency_response import NOTHING, RIGID, SHOWN
@@ -17,6 +16,7 @@ from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, MEAN_FALLBACK, P
 from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.machine.two_masses import CERTAIN_ZETA, SWING, UNSEEN, hides_play
+from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES
 from pmsmtool.units import RAD_S_PER_RPM
 
 RPM = RAD_S_PER_RPM
@@ -442,7 +442,7 @@ def _speed_of_voltage(s: _Sizes, i_q: float, V: float) -> float:
 
 
 def _weakening(s: _Sizes) -> Experiment | str:
-    if s.design["field_weakening.mode"] == FIELD_WEAKENING["off"]:
+    if s.design["field_weakening.mode"] == FIELD_WEAKENING_MODES["off"]:
         return "entry into field weakening: it is off in the design"
     if s.psi <= 0.0:
         return "entry into field weakening: no magnet flux"
