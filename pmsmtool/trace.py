@@ -52,7 +52,7 @@ class Trace(Summarised):
         try:
             return self.signals[name]
         except KeyError:
-            near = get_close_matches(name, self.signals, n=1)
+            near = get_close_matches(name, self.signals, n=1, cutoff=0.5)
             raise KeyError(f"no signal {name!r}" + (f"; did you mean {near[0]}?" if near else "")) from None
 
     def summary(self) -> Summary:
@@ -63,7 +63,17 @@ class Trace(Summarised):
             (name, units[name], *((f"{values.min():.5g}", f"{values.max():.5g}") if len(self) else ("", "")))
             for name, values in self.signals.items()
         ]
-        return Summary(f"trace: {len(self)} rows{span}", ("signal", "unit", "least", "largest"), rows)
+        notes = [self.trip] if self.trip else []
+        return Summary(f"trace: {len(self)} rows{span}", ("signal", "unit", "least", "largest"), rows, notes)
+
+    @property
+    def trip(self) -> str:
+        """Whether and when a simulated drive switched off by itself, as a sentence; else an empty text."""
+        codes = self.signals.get("trip")
+        if codes is None or not codes.any():
+            return ""
+        first = int((codes != 0).argmax())
+        return f"the drive tripped (error code {int(codes[first]):#06x}) at {self.t_s[first]:.6g} s"
 
     @staticmethod
     def load(path: str | Path) -> Trace:

@@ -122,17 +122,12 @@ def _changes(given: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _warn(trace: Trace, out: Output) -> None:
-    trip = int(trace["trip"][-1])
-    if trip:
-        out.warn(f"the drive tripped (error code {trip:#06x}) at {_trip_time(trace):.6g} s")
+    if trace.trip:
+        out.warn(trace.trip)
     if trace.meta["outside_flux_map"]:
         out.warn(f"{trace.meta['outside_flux_map']} evaluations outside the flux map: the currents leave its range")
     if trace.meta["event_overruns"]:
         out.warn(f"{trace.meta['event_overruns']} intervals of the inverter were not resolved to the last event")
-
-
-def _trip_time(trace: Trace) -> float:
-    return float(trace.t_s[(trace["trip"] != 0).argmax()])
 
 
 def _write(trace: Trace, path: Path | None, figure_path: Path | None, out: Output) -> None:

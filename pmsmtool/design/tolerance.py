@@ -12,12 +12,13 @@ import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 
 NORMAL_95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
@@ -144,19 +145,21 @@ class Samples:
 
 
 def tolerance_box(
-    source: MachineFile,
+    source: MachineFile | str | Path,
     *,
     U_dc_v: tuple[float, float] | None = None,
     T_winding_c: tuple[float, float] | None = None,
     T_magnet_c: tuple[float, float] | None = None,
 ) -> ToleranceBox:
-    """Collect the box of a machine file; ranges asked for win over its limits, those over assumptions.
+    """Collect the box of a machine file, or of its name; ranges asked for win over its limits, those over assumptions.
 
     Raises
     ------
     ConfigError
         A range that is empty or not finite.
     """
+    if not isinstance(source, MachineFile):
+        source = load_machine_file(source)
     notes = []
     factors = {}
     for name in PARAMETERS:

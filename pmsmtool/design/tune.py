@@ -36,6 +36,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.plausibility import implausible
 from pmsmtool.machine.speed_noise import quieter, speed_noise
 from pmsmtool.machine.two_masses import shafts_of, why_slower
 from pmsmtool.params.catalogue import CATALOGUE, FIELD_WEAKENING_MODES
@@ -82,7 +83,7 @@ def tune(source: MachineFile | str | Path, request: TuneRequest | None = None) -
     rated = ratings(source, V_limit, request.overspeed_protection)
     values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}
     values |= rating_values(source, rated)
-    told = (rated.reaction.note,) if rated.reaction.note else ()
+    told = (*implausible(source.machine, source.inverter), *filter(None, (rated.reaction.note,)))
     n_ucg = rated.reaction.generation_rpm
     generation = {} if math.isinf(n_ucg) else {"generation_rpm": n_ucg}
     choice = choose_current(source, request, rated.I_max_apk)

@@ -13,7 +13,7 @@ from pmsmtool.design.loops.current_loop import Method
 from pmsmtool.design.loops.speed_loop import SpeedMethod
 from pmsmtool.design.polar_laws import LAWS as POLAR_LAWS
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.key import Key, KeyKind, check_table
+from pmsmtool.machine.key import Key, KeyKind, check_table, not_numbers
 from pmsmtool.machine.uncontrolled_generation import Protection
 from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES, GOVERNOR_MODES
 
@@ -95,7 +95,8 @@ class TuneRequest:
     overspeed_protection: Protection | None = None
 
     def __post_init__(self) -> None:
-        wrong = []
+        if wrong := not_numbers(self):
+            raise ConfigError("the request cannot be used", where="tune", violations=wrong)
         choices = {
             "controller": CONTROLLERS,
             "polar_law": tuple(POLAR_LAWS),

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from difflib import get_close_matches
+from numbers import Real
 from typing import Any, Literal
 
 from pmsmtool.errors import ConfigError
@@ -124,10 +125,21 @@ def _kind(value: Any) -> str:
 
 
 def did_you_mean(name: str, known: Sequence[str]) -> str:
-    """Return ``; did you mean X?`` for the first known name that begins so, or the nearest; or an empty text."""
+    """Return ``; did you mean X?`` for the first known name that begins so, holds it, or is near; or an empty text."""
     begins = [each for each in known if name and each.startswith(name)]
-    near = begins or get_close_matches(name, known, n=1, cutoff=0.6)
+    holds = [each for each in known if len(name) > 2 and name in each]
+    near = begins or holds or get_close_matches(name, known, n=1, cutoff=0.6)
     return f"; did you mean {near[0]}?" if near else ""
+
+
+def not_numbers(request: Any) -> list[str]:
+    """Return what a dataclass declares a number and holds as something else, as violations."""
+    given = [(item.name, str(item.type).split(" ")[0], getattr(request, item.name)) for item in fields(request)]
+    return [
+        f"{name} is {value!r}, not a number"
+        for name, kind, value in given
+        if kind in ("float", "int") and not (value is None or isinstance(value, Real))
+    ]
 
 
 def check_table(

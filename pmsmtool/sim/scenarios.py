@@ -10,8 +10,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pmsmtool.errors import ConfigError, next_step
-from pmsmtool.machine.key import Key, Value, check_table, did_you_mean
+from pmsmtool.machine.key import Key, Value, check_table, did_you_mean, not_numbers
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.sim.kernel import Target
 from pmsmtool.sim.simulated_machine import ROTORS, RPM
@@ -59,6 +61,8 @@ SCHEDULES: dict[str, tuple[Target, float]] = {
 """Names of a ``[schedule]``, what they move, and the factor to SI."""
 
 LONGEST_S = 3600.0
+LATE = 100.0
+"""First change after this many durations: milliseconds where seconds are asked for, from a tenth of the run on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +105,9 @@ class Scenario:
 
 
 def _violations(scenario: Scenario) -> list[str]:
-    found: list[str] = []
+    found = not_numbers(scenario)
+    if found:
+        return found
     if not 0.0 < scenario.duration_s <= LONGEST_S:
         found.append(f"duration_s = {scenario.duration_s:g} is outside 0..{LONGEST_S:g} s")
     if scenario.mode not in MODES:
@@ -119,12 +125,19 @@ def _violations(scenario: Scenario) -> list[str]:
             found.append(f"[schedule] {name}: unknown{near}")
         elif isinstance(profile, (int, float)):
             found.append(f"[schedule] {name} is a number; write [(0.0, {profile!r})]: times in s and values")
-        elif not profile:
+        elif len(profile) == 0:
             found.append(f"[schedule] {name}: has no nodes")
+        elif not all(np.shape(node) == (2,) for node in profile):
+            found.append(f"[schedule] {name}: a node is not a time in s and a value; write [(0.0, 0.0), (0.01, 1.0)]")
         elif not all(math.isfinite(t) and math.isfinite(v) for t, v in profile):
             found.append(f"[schedule] {name}: a node is not finite")
         elif any(b[0] < a[0] for a, b in pairwise(profile)):
             found.append(f"[schedule] {name}: the times decrease")
+        elif len(profile) > 1 and profile[1][0] > LATE * scenario.duration_s:
+            found.append(
+                f"[schedule] {name}: the first change is at {profile[1][0]:g} s, the run ends at "
+                f"{scenario.duration_s:g} s; times are in s"
+            )
     return found
 
 

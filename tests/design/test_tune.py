@@ -223,6 +223,22 @@ def test_a_bad_request_lists_everything() -> None:
     assert len(caught.value.violations) == 4
 
 
+def test_text_is_no_bandwidth() -> None:
+    with pytest.raises(ConfigError, match="bandwidth_hz is '500Hz', not a number"):
+        TuneRequest(bandwidth_hz="500Hz")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [({"R_s_ohm": 137.0}, "check R and the DC link"), ({"L_d_h": 2.3, "L_q_h": 2.1}, "check the units of L"),
+     ({"psi_f_wb": 4.1}, "the back-EMF at rated speed is 1065 V peak")],
+)  # fmt: skip
+def test_a_value_in_another_unit_is_named_by_the_design(changes: dict[str, float], said: str) -> None:
+    source = load_machine_file("jercic-2017")
+    assert not any(said in note for note in tune(source).notes)
+    assert any(said in note for note in tune(replace(source, machine=replace(source.machine, **changes))).notes)
+
+
 def test_values_outside_the_catalogue_are_refused() -> None:
     with pytest.raises(DesignInfeasible, match="range of the drive"):
         tune(replace(SURFACE, machine=replace(SURFACE.machine, L_d_h=11.0, L_q_h=11.0)))

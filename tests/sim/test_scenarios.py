@@ -181,6 +181,32 @@ def test_all_violations_are_listed_at_once(tmp_path):
     assert len(caught.value.violations) == 2
 
 
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"duration_s": "60ms"}, "duration_s is '60ms', not a number"),
+        ({"schedule": {"i_q_a": [(0.0, 0.0), (10.0, 5.0)]}}, "first change is at 10 s, the run ends at 0.06 s"),
+        ({"schedule": {"i_q_a": ([0.0, 0.01, 0.02], [0.0, 0.0, 5.0])}}, "a node is not a time in s and a value"),
+    ],
+)
+def test_a_scenario_in_another_unit_or_form_is_refused(changes, said):
+    with pytest.raises(ConfigError) as caught:
+        Scenario(**{"name": "mine", "duration_s": 0.06, "mode": "current", **changes})
+    assert said in str(caught.value)
+
+
+def test_nodes_may_be_the_rows_of_an_array():
+    nodes = np.array([[0.0, 0.0], [0.01, 5.0]])
+    assert len(Scenario("mine", 0.06, "current", {"i_q_a": nodes}).schedule["i_q_a"]) == 2
+
+
+def test_a_trace_says_that_the_drive_tripped(drive):
+    healthy = run_scenario(drive, find_scenario("q-step", drive))
+    assert "tripped" not in repr(healthy)
+    fast = Scenario("fast", 0.01, "current", {"driven_rpm": [(0.0, 9000.0)]}, rotor="driven", start_rpm=9000.0)
+    assert "the drive tripped (error code 0x" in repr(run_scenario(drive, fast))
+
+
 def test_missing_file_and_unknown_name(tmp_path, drive):
     with pytest.raises(ConfigError, match="no such file"):
         find_scenario(str(tmp_path / "nothing.toml"), drive)
