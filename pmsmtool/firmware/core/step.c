@@ -129,6 +129,21 @@ static void follow_saturation(pmsm_period *period, pmsm_dq i)
     }
 }
 
+/* At the voltage limit i_q lags its reference: the field-weakening current takes no more than what i_q itself leaves of
+ * the limit, as long as the voltage still reduces i_q there. Where the EMF drives i_q on, only weaker flux helps. */
+static void hold_weakening(pmsm_period *period)
+{
+    const uint32_t limited = period->state->live.flags & (uint32_t)PMSM_FLAG_VOLTAGE_LIMITED; /* in the last period */
+    if (limited == 0u || period->request->mode == PMSM_MODE_CURRENT) {
+        return;
+    }
+    const pmsm_real limit = pmsm_current_limit(period);
+    const pmsm_real rest = limit * limit - period->i_model.q * period->i_model.q;
+    if (rest > PMSM_C(0.0) && pmsm_abs(pmsm_model_voltage(period, period->i_model).q) < period->V_max) {
+        period->reference.d = pmsm_clamp(period->reference.d, -PMSM_SQRT(rest), limit);
+    }
+}
+
 static void field_oriented(pmsm_period *period, pmsm_output *output)
 {
     if (period->state->derived.predicts != 0u) {
@@ -141,6 +156,7 @@ static void field_oriented(pmsm_period *period, pmsm_output *output)
     const uint32_t governed = 0u;
 #endif
     if (governed == 0u) {
+        hold_weakening(period);
         pmsm_current_demand(period);
     }
     pmsm_modulate(period, output);
