@@ -94,10 +94,10 @@ class BridgeSaturation:
         return np.stack([step_d, step_q])
 
 
-def saturated_pmsyrm_map() -> FluxMap:
-    """Return the flux map of the profile ``saturated-pmsyrm``: 53 x 53 nodes, +-26 A, the trip current."""
+def saturated_pmsyrm_map(form: BridgeSaturation = BridgeSaturation()) -> FluxMap:
+    """Return a flux map like that of the profile ``saturated-pmsyrm``: 53 x 53 nodes, +-26 A, the trip current."""
     i_d = i_q = np.arange(-26.0, 27.0)
-    psi_d, psi_q = BridgeSaturation().flux(*np.meshgrid(i_d, i_q, indexing="ij"))
+    psi_d, psi_q = form.flux(*np.meshgrid(i_d, i_q, indexing="ij"))
     origin = "analytic model, Lelli, Hinkkanen, Giulii Capponi, ICEM 2024, 5.6-kW PM-SyRM"
     # + 0.0 turns -0.0 into 0.0
     tabulated_d, tabulated_q = (np.round(psi, MAP_DIGITS) + 0.0 for psi in (psi_d, psi_q))

@@ -9,7 +9,8 @@ one that the voltage does not reach. Settled: within 2 % of the step (1 % of I_m
 *Voltage binds*: reachable steps in which the law without governor demands more than V_max after the step.
 
 ``--noise 0.0018`` adds white noise to the phase currents (of I_max, rms: 0.1 A on 56 A). ``--second-plant`` takes motor
-and bridge of ``benchmarks/second_plant``, which knows no flux map: the saturated third stays on the project's own.
+and bridge of ``benchmarks/second_plant``, and for the saturated third its machine of a closed form, each constant drawn
+around those of ``saturated-pmsyrm``; the design has the flux map of 53 x 53 nodes of the same form.
 
 Laws: the default; the same without governor; both with predictor. Settling is compared case by case. Exit code 1: the
 default exceeds ``OVER``, is slower than ``SLOWER`` on reachable steps, or settles later than ``LATE_P95_MS`` (95 %) or
@@ -22,7 +23,7 @@ import argparse
 import contextlib
 import math
 import sys
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks import second_plant
+from benchmarks.analytic_saturation import BridgeSaturation, saturated_pmsyrm_map
 from benchmarks.random_drives import draw_around, draw_drive
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import ratings
@@ -54,6 +56,8 @@ SLOWER = 1.02
 """Upper end of the interval of the paired settling, over that without governor."""
 LATE_P95_MS, LATEST_MS = 12.0, 40.0
 """Settling on references out of reach."""
+FORM_SPREAD = 0.15
+"""Standard deviation of the logarithm of each constant of a closed form."""
 KINDS = ("linear", "salient", "saturated")
 REQUESTS = {
     "default": TuneRequest(),
@@ -75,6 +79,14 @@ def draw(kind: str, seed: int) -> MachineFile:
         base = replace(base, machine=replace(base.machine, L_q_h=L_d * float(rng.uniform(low, high))))
     truth = {"R_s_ohm": base.machine.R_s_ohm} if kind == "saturated" else {}
     return replace(base, simulation={**IDEAL, **truth}, inverter=replace(base.inverter, V_dead_v=0.0))
+
+
+def draw_form(seed: int) -> tuple[BridgeSaturation, MachineFile]:
+    """Return a saturating machine as a closed form, and the same machine by its flux map."""
+    form = BridgeSaturation()
+    factors = np.exp(FORM_SPREAD * np.random.default_rng([20261127, seed]).standard_normal(8))
+    form = BridgeSaturation(*(x * y for x, y in zip(astuple(form), factors, strict=True)))
+    return form, replace(draw("saturated", seed), flux_map=saturated_pmsyrm_map(form))
 
 
 class Steps:
@@ -142,6 +154,13 @@ def run(
     return settled, float(np.hypot(*after).max()), bool(demanded > 1.001 * source.inverter.V_max_v)
 
 
+def plant(second: bool, form: BridgeSaturation | None) -> contextlib.AbstractContextManager[object]:
+    """Return the context in which the machine is simulated."""
+    if form is not None:
+        return second_plant.saturated(form)
+    return second_plant.used() if second else contextlib.nullcontext()
+
+
 def ratio(pairs: np.ndarray) -> tuple[float, float, float]:
     """Geometric mean of the first column over the second, with its 95 % interval by the bootstrap."""
     log = np.log(pairs[:, 0] / pairs[:, 1])
@@ -164,14 +183,15 @@ def main() -> int:
     rows: dict[str, list[tuple[str, int, bool, bool, float, float]]] = {law: [] for law in REQUESTS}
     for k in range(asked.machines):
         kind = asked.kind or KINDS[k % len(KINDS)]
-        source = draw(kind, 1000 * asked.seed + k)
+        form, source = None, draw(kind, 1000 * asked.seed + k)
+        if asked.second_plant and kind == "saturated":
+            form, source = draw_form(1000 * asked.seed + k)
         steps = Steps(source, 1000 * asked.seed + k)
         cases = [(reachable, steps.draw(reachable)) for reachable in (True, False) for _ in range(asked.steps)]
         noise = {"sensor_noise_apk": asked.noise * steps.rated.I_max_apk}
         drive = replace(source, simulation={**source.simulation, **noise})
         sets = {law: tune(source, request).parameter_set() for law, request in REQUESTS.items()}
-        other = asked.second_plant and kind != "saturated"
-        with second_plant.used() if other else contextlib.nullcontext():
+        with plant(asked.second_plant, form):
             binds = [run(drive, sets["no governor"], step)[2] for _, step in cases]
             for law, params in sets.items():
                 for n, (reachable, step) in enumerate(cases):

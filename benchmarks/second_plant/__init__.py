@@ -14,6 +14,10 @@ shows, and is recorded here with the old and the new digest:
 
 a3db7fe80fbb79337235f9a8e310313a6baf6a44513be2c807f5fc83aa6f4d88  since the first commissioning (drive 170000)
 
+A machine that saturates is another one, ``saturated/machine.c``: the closed form of ``analytic_saturation.py`` at an
+imposed speed behind the project's ideal bridge, without any map. It is for control, not for identification, and not
+part of the digest.
+
 A known difference from the first plant that is not numerics: a sample of the first plant holds the core's mean current
 of the last period, one of this plant that of the sampling instant.
 """
@@ -22,6 +26,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import dataclasses
 import functools
 import hashlib
 import tempfile
@@ -30,6 +35,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from benchmarks.analytic_saturation import BridgeSaturation
 from pmsmtool import native
 from pmsmtool.errors import ConfigError
 from pmsmtool.native import library_name
@@ -45,6 +51,8 @@ FOLDER = Path(__file__).resolve().parent
 NAME = "pmsm_sim"
 REPLACED = ("plant.c", "plant_circuit.c", "inverter.c", "leg_circuit.c")
 """Sources of the kernel that this folder's take the place of."""
+MACHINE_ALONE = ("plant.c", "plant_circuit.c")
+"""Those that the saturated machine takes the place of."""
 
 
 def sources() -> list[Path]:
@@ -61,24 +69,25 @@ def digest() -> str:
 
 
 @functools.cache
-def build() -> Path:
-    """Compile the kernel with this plant into the folder for temporary files, once per state of all its sources.
+def build(folder: Path = FOLDER, replaced: tuple[str, ...] = REPLACED) -> Path:
+    """Compile the kernel with a folder's plant into the folder for temporary files, once per state of all its sources.
 
     Raises
     ------
     CompilerError
         No compiler works here.
     """
-    kept = [path for path in (PACKAGE / "sim").glob("*.c") if path.name not in REPLACED]
+    kept = [path for path in (PACKAGE / "sim").glob("*.c") if path.name not in replaced]
+    own = sorted([*folder.glob("*.c"), *folder.glob("*.h")])
     row = Kernel(
         NAME,
         (
             *(path.relative_to(PACKAGE).as_posix() for path in kept),
-            *(f"{folder}/*.c" for folder in ("machine", "firmware/application", "firmware/core")),
-            f"../{FOLDER.parent.name}/{FOLDER.name}/*.c",
+            *(f"{part}/*.c" for part in ("machine", "firmware/application", "firmware/core")),
+            f"../{folder.relative_to(PACKAGE.parent).as_posix()}/*.c",
         ),
     )
-    inputs = {*(PACKAGE / path for path in row.source_files(PACKAGE)), *sources()}
+    inputs = {*(PACKAGE / path for path in row.source_files(PACKAGE)), *own}
     inputs |= {path for pattern in HEADERS for path in PACKAGE.glob(pattern)}
     state = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(inputs))).hexdigest()[:16]
     library = Path(tempfile.gettempdir()) / f"pmsm-second-plant-{state}" / library_name(NAME)
@@ -101,10 +110,7 @@ def used() -> Iterator[str]:
     ConfigError
         From a simulation that is opened inside: it has a flux map, which this plant does not know.
     """
-    own, first_load, first_init = ctypes.CDLL(str(build())), native.load, Simulation.__init__
-
-    def load(name: str) -> Any:
-        return own if name == NAME else first_load(name)
+    first_load, first_init = native.load, Simulation.__init__
 
     def init(self: Simulation, setup: Setup, image: bytes, keep: object = None) -> None:
         if setup.machine.map:
@@ -118,8 +124,31 @@ def used() -> Iterator[str]:
         with _simulating(first_load, first_init):
             return predict_proof(*arguments, **options)
 
-    with _simulating(load, init), unittest.mock.patch.object(stage, "predict_proof", predict):
+    with _simulating(_loads(build()), init), unittest.mock.patch.object(stage, "predict_proof", predict):
         yield digest()
+
+
+@contextlib.contextmanager
+def saturated(form: BridgeSaturation) -> Iterator[None]:
+    """Simulate with the machine of a closed form inside the block, in this process, at driven speeds and constant R.
+
+    The flux map of the machine file is not read: it is what the design knows.
+
+    Raises
+    ------
+    CompilerError
+        No compiler works here.
+    """
+    library = build(FOLDER / "saturated", MACHINE_ALONE)
+    constants = dataclasses.astuple(form)
+    ctypes.CDLL(str(library)).saturated_machine_set((ctypes.c_double * len(constants))(*constants))
+    with _simulating(_loads(library), Simulation.__init__):
+        yield
+
+
+def _loads(library: Path) -> Callable[[str], Any]:
+    own, first = ctypes.CDLL(str(library)), native.load
+    return lambda name: own if name == NAME else first(name)
 
 
 @contextlib.contextmanager

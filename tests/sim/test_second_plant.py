@@ -10,8 +10,10 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from benchmarks import second_plant
+from benchmarks.analytic_saturation import BridgeSaturation
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.packaging.compiler import CompilerError
@@ -45,6 +47,10 @@ SWING = 1e-3
 """Of the amplitude after many swings, whose phase drifts with the square of the step (measured 3e-4)."""
 BRIDGE = 1e-3
 """Of the lost voltage: ripple moves the instants of commutation (measured 5e-4)."""
+
+
+SATURATED = 1e-9
+"""Of the largest current, eight steps a period (measured 1.5e-11)."""
 
 
 def locked(**machine: float) -> Change:
@@ -330,3 +336,24 @@ def test_it_refuses_a_flux_map() -> None:
     setup, keep = build_setup(load_machine_file(data_folder("profiles") / "saturated-pmsyrm.toml"))
     with pytest.raises(ConfigError, match="cannot simulate a flux map"):
         Simulation(setup, b"", keep)
+
+
+def test_a_saturating_machine_moves_as_its_closed_form_says() -> None:
+    form, omega_e, u = BridgeSaturation(), 60.0 * POLE_PAIRS, 40.0 + 25.0j
+
+    def slope(t: float, psi: np.ndarray) -> list[float]:
+        i_d, i_q = form.current(*psi)
+        u_dq = u * cmath.exp(-1j * omega_e * t)
+        return [u_dq.real - R_S * i_d + omega_e * psi[1], u_dq.imag - R_S * i_q - omega_e * psi[0]]
+
+    rest = [float(x) for x in form.flux(0.0, 0.0)]
+    t = T_S * np.arange(1, 101)
+    wanted = form.current(*solve_ivp(slope, (0.0, t[-1]), rest, "DOP853", t, rtol=1e-11, atol=1e-13).y)
+    try:
+        with second_plant.saturated(form):
+            found = plant_run(open_simulation(turning(60.0)), [u] * len(t), T_S)
+    except CompilerError as error:
+        pytest.skip(f"no compiler: {error}")
+    wanted = wanted[0] + 1j * wanted[1]
+    assert np.ptp(np.abs(wanted)) > 5.0
+    assert np.abs(found - wanted).max() < SATURATED * np.abs(wanted).max()
