@@ -311,13 +311,21 @@ _TEXT = """/* SPDX-License-Identifier: MIT */
  *
  * Built only with PMSM_EXAMPLE_MAIN defined, for example (flags: see @_cfg.h)
  *     cc -std=c99 -O2 -ffp-contract=off -fno-math-errno -DPMSM_EXAMPLE_MAIN *.c -o example -lm
- * Exit code 0: the current was reached; 1: it was not; 2: the configuration is damaged.
+ * Exit code 0: the current was reached; 1: it was not; 2: the configuration is damaged. With a C library it prints
+ * the likely cause.
  * In a drive, control_period() is what the PWM interrupt calls: samples in, duty ratios out.
  */
 #include "@_cfg.h"
 #include "pmsm_image.h"
 
 #ifdef PMSM_EXAMPLE_MAIN
+
+#ifdef PMSM_NO_C_LIBRARY
+#define SAY(text) ((void)(text))
+#else
+#include <stdio.h> /* not found: without a C library add -DPMSM_NO_C_LIBRARY */
+#define SAY(text) ((void)puts(text))
+#endif
 
 #define PERIODS 6000u
 #define SETTLED 0.02F /* of the request */
@@ -363,6 +371,20 @@ static void advance(windings *motor, const pmsm_output *output)
     motor->u_q = output->u_beta;
 }
 
+static const char *cause(const pmsm_output *output)
+{
+    if (state.fault == (uint32_t)PMSM_FAULT_INPUT) {
+        return "fault 1: a sample or a request is not a number or too large: see sampled and request";
+    }
+    if (state.fault != 0u) {
+        return "fault 2: no usable result: is it the image that pmsm_image_check saw?";
+    }
+    if (output->gates == 0u) {
+        return "the gates are off: is request.mode set?";
+    }
+    return "the current was not reached: check order and signs of i_a, i_b, i_c, theta_e, U_dc and the duties";
+}
+
 int main(void)
 {
     const uint8_t *image = (const uint8_t *)&@_cfg;
@@ -371,6 +393,7 @@ int main(void)
     pmsm_output output;
     if (pmsm_image_check(image, @UP@_CFG_BYTES, @UP@_CFG_SCHEMA_VERSION, @UP@_CFG_SIGNATURE, @UP@_CFG_CRC32) !=
         (uint32_t)PMSM_IMAGE_OK) {
+        SAY("@_cfg.c is not as it was exported (changed by hand?): export again with the values wanted");
         return 2;
     }
     pmsm_init(&state);
@@ -379,7 +402,11 @@ int main(void)
         advance(&motor, &output);
     }
     const float error = motor.i_q - request;
-    return (error <= SETTLED * request && error >= -SETTLED * request) ? 0 : 1;
+    if (error <= SETTLED * request && error >= -SETTLED * request) {
+        return 0;
+    }
+    SAY(cause(&output));
+    return 1;
 }
 
 #endif

@@ -193,16 +193,41 @@ def test_the_example_compiles_without_a_warning_and_reaches_its_current(case: st
     assert subprocess.run([tmp_path / "example"]).returncode == 0
 
 
+FAULTS = {  # what a person gets wrong -> file, text, wrong text, exit code, what the example prints
+    "a constant changed by hand": ("cfg", "pole_pairs = 4u", "pole_pairs = 5u", 2, "_cfg.c is not as it was"),
+    "a sample is no number": ("main", "sampled.i_a = motor->i_d", "sampled.i_a = 0.0F / 0.0F", 1, "fault 1"),
+    "no mode is asked for": ("main", "request.mode = PMSM_MODE_CURRENT", "request.mode = PMSM_MODE_OFF", 1, "gates"),
+    "two phases are swapped": ("main", "0.866025404F", "-0.866025404F", 1, "order and signs of i_a, i_b, i_c"),
+}  # fmt: skip
+
+
 @needs_compiler
-def test_the_example_notices_a_damaged_configuration(tmp_path: Path) -> None:
-    sources = [path.name for path in export(tmp_path, tuned(), b"")]
-    cfg = tmp_path / "motor_cfg.c"
-    cfg.write_text(cfg.read_text().replace(".motor_pole_pairs = 4u", ".motor_pole_pairs = 5u"))
+def test_the_example_prints_the_likely_cause(tmp_path: Path) -> None:
     assert COMPILER is not None
-    subprocess.run(
-        [COMPILER, "-std=c99", "-DPMSM_EXAMPLE_MAIN", "-o", "example", *sources, "-lm"], cwd=tmp_path, check=True
-    )
-    assert subprocess.run([tmp_path / "example"]).returncode == 2
+    command = [COMPILER, "-std=c99", "-fno-math-errno", "-DPMSM_EXAMPLE_MAIN"]
+    for path in export(tmp_path, tuned(), b""):
+        if path.stem not in ("motor_main", "motor_cfg"):
+            subprocess.run([*command, "-c", path.name], cwd=tmp_path, check=True)
+    held = {part: (tmp_path / f"motor_{part}.c").read_text() for part in ("main", "cfg")}
+    objects = [path.name for path in tmp_path.glob("*.o")]
+    for part, right, wrong, code, said in FAULTS.values():
+        for name, text in held.items():
+            (tmp_path / f"motor_{name}.c").write_text(text.replace(right, wrong) if name == part else text)
+        subprocess.run(
+            [*command, "motor_main.c", "motor_cfg.c", *objects, "-o", "example", "-lm"], cwd=tmp_path, check=True
+        )
+        done = subprocess.run([tmp_path / "example"], capture_output=True, text=True)
+        assert (done.returncode, said in done.stdout) == (code, True), (said, done.stdout)
+
+
+@needs_compiler
+def test_a_compiler_that_knows_no_nan_is_refused(tmp_path: Path) -> None:
+    """-ffast-math lets a compiler drop the comparisons that keep such a sample from the voltage."""
+    export(tmp_path, tuned(), b"")
+    assert COMPILER is not None
+    command = [COMPILER, "-std=c99", "-ffast-math", "-fsyntax-only", "pmsm_step.c"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode and "samples which are not a number" in done.stderr
 
 
 @pytest.mark.skipif(bool(cortex_m.missing()), reason=f"absent: {cortex_m.missing()}")

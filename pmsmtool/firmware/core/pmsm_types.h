@@ -11,6 +11,10 @@
 
 #include <stdint.h>
 
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__ > 0
+#error "without -ffast-math and -Ofast: they remove the checks that find samples which are not a number"
+#endif
+
 #ifdef __cplusplus
 extern "C" {
 #endif
