@@ -39,6 +39,7 @@ from pmsmtool.measurement.identify import OF_LEVEL, SET_UP, identify, identify_a
 from pmsmtool.measurement.task import Allow, Say
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.proof.stage import ProofRequest, prove_stage
+from pmsmtool.report.verdict import ENCODER_SIGN
 from pmsmtool.run_directory import RunDirectory, Stage
 
 DATA_SHEET = "as given"
@@ -274,6 +275,8 @@ class LevelStages:
 
     def _no_writing(self) -> str:
         """Return why nothing can be written, empty when something can."""
+        if sign := _wrong_sign(self.run):
+            return sign
         drive_map = self.found.drive_map
         if not drive_map.cells:
             return f"needs a map with objects for parameters: {drive_map.name!r} has none"
@@ -286,6 +289,8 @@ class LevelStages:
         return "" if self.drive.node.can_store() else NO_STORE
 
     def _no_proof(self) -> str:
+        if sign := _wrong_sign(self.run):
+            return sign
         if self.found.drive_map.staging and (self.injects or self.found.level is CapabilityLevel.RECORDER):
             return ""
         cells = self.found.drive_map.cells
@@ -313,6 +318,14 @@ def _stopped(stage: Stage, given: object) -> Stage:
     Without a machine file that a person gave, the drive's own set would stand in: it may be another machine's.
     """
     return replace(stage, status="fail") if blocking(stage.refused, given=given is not None) else stage
+
+
+def _wrong_sign(run: RunDirectory) -> str:
+    """Return why no loop may be closed: the position falls under positive torque; empty where nothing shows that."""
+    identified = run.read().stage("identify")
+    if identified is None or ENCODER_SIGN not in identified.refused:
+        return ""
+    return f"{ENCODER_SIGN} WRONG: swap two motor leads, or the encoder's tracks; then begin a new run"
 
 
 def _without_base(run: RunDirectory, drive_map: DriveMap) -> list[str]:

@@ -40,8 +40,9 @@ from pmsmtool.measurement.identify import SET_UP, open_for_level
 from pmsmtool.papers.closed_drive import ClosedNode
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.proof.stage import ProofRequest
+from pmsmtool.report.verdict import ENCODER_SIGN
 from pmsmtool.resources import data_folder
-from pmsmtool.run_directory import RunDirectory
+from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim import channel
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
@@ -400,5 +401,23 @@ def test_a_measurement_that_is_not_accepted_says_what_to_change(
 def test_a_map_with_every_gain_says_what_a_proof_lacks_besides(tmp_path: Path) -> None:
     """It ended "the map has no object for" and named none."""
     found = SimpleNamespace(drive_map=replace(reference_map(), staging=False))
-    stages: Any = SimpleNamespace(found=found, run=SimpleNamespace(path=tmp_path))
+    stages: Any = SimpleNamespace(found=found, run=_run(tmp_path))
     assert LevelStages._no_proof(stages) == NO_STEPS
+
+
+def test_a_drive_whose_encoder_counts_backwards_gets_no_gains_and_no_proof(tmp_path: Path) -> None:
+    """Swapped leads were named by identify, and the gains written all the same: a loop over that sign runs away."""
+    run = _run(tmp_path)
+    run.save("design.toml", "")
+    run.add(Stage("identify", "partial", 1.0, refused={ENCODER_SIGN: "the position falls under positive torque"}))
+    drive: Any = None
+    found: Any = SimpleNamespace(identity=SimpleNamespace(node=1))
+    stages = LevelStages(run, drive, found, None)
+    quiet: Any = None
+    for closed in (lambda: stages.flash(quiet, quiet), stages.verify, lambda: stages.prove(quiet, quiet, quiet)):
+        with pytest.raises(NotAvailable, match="encoder sign WRONG: swap two motor leads"):
+            closed()
+
+
+def _run(folder: Path) -> RunDirectory:
+    return RunDirectory.create(folder, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
