@@ -311,8 +311,7 @@ _TEXT = """/* SPDX-License-Identifier: MIT */
  *
  * Built only with PMSM_EXAMPLE_MAIN defined, for example (flags: see @_cfg.h)
  *     cc -std=c99 -O2 -ffp-contract=off -fno-math-errno -DPMSM_EXAMPLE_MAIN *.c -o example -lm
- * Exit code 0: the current was reached; 1: it was not; 2: the configuration is damaged. With a C library it prints
- * the likely cause.
+ * Exit code 0: the current was reached; 1: it was not; 2: the configuration is damaged (the likely cause is printed).
  * In a drive, control_period() is what the PWM interrupt calls: samples in, duty ratios out.
  */
 #include "@_cfg.h"
@@ -373,16 +372,11 @@ static void advance(windings *motor, const pmsm_output *output)
 
 static const char *cause(const pmsm_output *output)
 {
-    if (state.fault == (uint32_t)PMSM_FAULT_INPUT) {
-        return "fault 1: a sample or a request is not a number or too large: see sampled and request";
-    }
-    if (state.fault != 0u) {
-        return "fault 2: no usable result: is it the image that pmsm_image_check saw?";
-    }
-    if (output->gates == 0u) {
-        return "the gates are off: is request.mode set?";
-    }
-    return "the current was not reached: check order and signs of i_a, i_b, i_c, theta_e, U_dc and the duties";
+    return (state.fault == (uint32_t)PMSM_FAULT_INPUT)
+               ? "fault 1: a sample or a request is not a number or too large: see sampled and request"
+           : (state.fault != 0u)    ? "fault 2: no usable result: is it the image that pmsm_image_check saw?"
+           : (output->gates == 0u) ? "the gates are off: is request.mode set?"
+                                   : "the current was not reached: check order and signs of i_a, i_b, i_c, theta_e";
 }
 
 int main(void)
@@ -402,11 +396,9 @@ int main(void)
         advance(&motor, &output);
     }
     const float error = motor.i_q - request;
-    if (error <= SETTLED * request && error >= -SETTLED * request) {
-        return 0;
-    }
-    SAY(cause(&output));
-    return 1;
+    const int reached = error <= SETTLED * request && error >= -SETTLED * request;
+    SAY(reached ? "the current was reached" : cause(&output));
+    return reached ? 0 : 1;
 }
 
 #endif
