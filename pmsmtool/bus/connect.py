@@ -107,7 +107,11 @@ def _completed(arguments: dict[str, Any], configured: dict[str, Any]) -> dict[st
     missing = {key: value for key, value in SOCKETCAND_DEFAULTS.items() if configured.get(key) is None}
     server = {**configured, **missing}
     # python-can tries for ten seconds; where nobody listens that is known at once.
-    socket.create_connection((server["host"], int(server["port"])), _SERVER_TIMEOUT_S).close()
+    place = server["host"], int(server["port"])
+    try:
+        socket.create_connection(place, _SERVER_TIMEOUT_S).close()
+    except ConnectionError as error:
+        raise ConnectionError(f"no server listens at {place[0]}:{place[1]}") from error
     # Without tcp_tune Nagle's algorithm makes block transfers 17 times slower (docs/canopen.md, 1).
     return {"tcp_tune": True, **arguments, **missing}
 
@@ -145,7 +149,7 @@ def _why_closed(name: str | None, error: Exception) -> str:
     if isinstance(error, TimeoutError):
         return "what listens there is no socketcand server, or it hangs" if name == "socketcand" else "it hangs"
     if isinstance(error, ConnectionError):
-        return "no server listens there; `pmsmtool sim serve` starts one"
+        return "`pmsmtool sim serve` does not run, or serves at another port: `port = N` below [default] in ~/can.conf"
     if getattr(error, "errno", None) == errno.EAFNOSUPPORT:
         return "this system has no SocketCAN"
     if getattr(error, "errno", None) == errno.ENODEV:

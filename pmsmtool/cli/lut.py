@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.options import FILE, Quantity, examples, output_options, overspeed_option
-from pmsmtool.cli.output import Output, save_figure
+from pmsmtool.cli.options import FILE, NPZ, Quantity, examples, output_options, overspeed_option
+from pmsmtool.cli.output import Output, figure_format, save_figure
 from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ _TEMPERATURE = Quantity("temperature")
     ),
 )
 @click.argument("source")
-@click.option("-o", "--output", "path", type=FILE, required=True, help="Table to write (.npz); a .csv goes beside it.")
+@click.option("-o", "--output", "path", type=NPZ, required=True, help="Table to write (.npz); a .csv goes beside it.")
 @click.option("--axis", type=click.Choice(["speed", "flux"]), default="speed", help="Second axis.")
 @click.option("--torque-points", type=int, metavar="N", help="Uniform torque axis.  [default: refined to the bounds]")
 @click.option("--speed-points", "y_points", type=int, metavar="N", help="Uniform second axis.")
@@ -78,6 +78,8 @@ def lut_command(
     from pmsmtool.machine.iron_loss_map import load_iron_loss_map
     from pmsmtool.machine.profile import machine_path
 
+    if plot_path is not None:
+        figure_format(plot_path)
     machine, design = load_machine_or_design(source)
     if iron_loss is None and machine.machine.iron_loss_map is not None:
         iron_loss = machine_path(source).parent / machine.machine.iron_loss_map

@@ -49,7 +49,9 @@ class WholeNumber(click.ParamType[int]):
         try:
             number = value if isinstance(value, int) else int(str(value), 0)
         except ValueError:
-            self.fail(f"{value!r} is no whole number (decimal or 0x...)", param, ctx)
+            meant = re.fullmatch(r"(\d+) ?[kK].*", str(value))
+            near = f"; did you mean {meant[1]}000?" if meant else ""
+            self.fail(f"{value!r} is no whole number (decimal or 0x...){near}", param, ctx)
         if not self.lowest <= number <= self.highest:
             self.fail(f"{number} is outside {self.lowest}..{self.highest}", param, ctx)
         return number
@@ -93,7 +95,14 @@ class Quantity(click.ParamType[float]):
 
 
 class FilePath(click.Path):
-    """A path, as ``pathlib.Path``; that module is imported when a path is given, not with this one."""
+    """A path, as ``pathlib.Path``; that module is imported when a path is given, not with this one.
+
+    A name that ends as another kind of file than ``ending`` is refused.
+    """
+
+    def __init__(self, ending: str = "", *, dir_okay: bool = True) -> None:
+        super().__init__(dir_okay=dir_okay)
+        self.ending = ending
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path, or fail as a usage error."""
@@ -101,13 +110,16 @@ class FilePath(click.Path):
 
         if value == "-":  # else a file of that name is made, which few shells remove
             self.fail("'-' is not the name of a file; where the system has /dev/stdout, give that", param, ctx)
-        return Path(os.fsdecode(super().convert(value, param, ctx)))
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        if self.ending and path.suffix.lower() not in ("", self.ending):
+            self.fail(f"{path.name!r} ends in {path.suffix}; what is written is {self.ending}", param, ctx)
+        return path
 
 
 NODE = WholeNumber("node", 1, 127)
 BITRATE = WholeNumber("bit rate", 1, 10**7)
 HZ, DEG, DB = (Quantity(unit, bare=True) for unit in ("Hz", "deg", "dB"))
-FILE = FilePath(dir_okay=False)
+FILE, TOML, NPZ = (FilePath(ending, dir_okay=False) for ending in ("", ".toml", ".npz"))
 SERIAL = WholeNumber("serial", 0, 0xFFFFFFFF_FFFFFFFF)
 CURRENT = Quantity("current")
 SPEED = Quantity("angular speed")

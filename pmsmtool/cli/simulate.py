@@ -65,8 +65,6 @@ def simulate_command(
         raise click.UsageError("missing argument DESIGN: a design, a machine file, a run directory or a profile")
     if scenario is None:
         raise click.UsageError("which --scenario? --list names the built-in ones")
-    if path is None and figure_path is None and not out.json:
-        raise click.UsageError("nothing to write: give -o, --plot or --json")
     from pmsmtool.cli.output import figure_format
     from pmsmtool.errors import ConfigError
     from pmsmtool.sim.simulate import find_drive, find_scenario, run_scenario
@@ -76,9 +74,10 @@ def simulate_command(
     if figure_path is not None:
         figure_format(figure_path)
     drive = find_drive(design, params)
-    trace = run_scenario(
-        drive, find_scenario(scenario, drive), seed=seed, duration_s=duration_s, simulation=_changes(changes)
-    )
+    found = find_scenario(scenario, drive)
+    if path is None and figure_path is None and not out.json:
+        raise click.UsageError("nothing to write: give -o, --plot or --json")
+    trace = run_scenario(drive, found, seed=seed, duration_s=duration_s, simulation=_changes(changes))
     if drive.origin != "design":
         out.note(f"parameters: {drive.origin}")
     for note in drive.notes:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.drive_access import map_option, read_map
-from pmsmtool.cli.options import DB, DEG, FILE, HZ, examples, options_named, output_options, overspeed_option
+from pmsmtool.cli.options import DB, DEG, FILE, HZ, TOML, examples, options_named, output_options, overspeed_option
 from pmsmtool.cli.output import Output, figure_format, save_figure, table
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import write_file
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     ),
 )
 @click.argument("machine")
-@click.option("-o", "--output", "path", type=FILE, required=True, help="Design file to write.")
+@click.option("-o", "--output", "path", type=TOML, required=True, help="Design file to write.")
 @click.option("--params", "params_path", type=FILE, help="Parameter set to write.  [default: beside "
               "it, params.toml for design.toml, X.params.toml for X.toml]")  # fmt: skip
 @click.option("--plot", "plot_path", type=FILE, help="Bode plot of the loops to write (.svg, .png, .pdf).")

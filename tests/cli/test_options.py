@@ -6,16 +6,19 @@ from __future__ import annotations
 import math
 import os
 import re
+import socket
 from pathlib import Path
 
 import click
 import pytest
 from click.testing import CliRunner
 
+from pmsmtool.bus.connect import connect
 from pmsmtool.cli import options
 from pmsmtool.cli.options import BusOptions, MotionOptions
 from pmsmtool.cli.output import Output
 from pmsmtool.cli.sim import _how_to_join
+from pmsmtool.errors import BusError
 from tests.cli.conftest import Tool
 
 
@@ -124,6 +127,30 @@ def test_a_dash_is_no_file(tool: Tool) -> None:
     """Before, ``-o -`` left a file of that name."""
     code, _, err = tool("tune", "interior-2k2", "-o", "-")
     assert code == 2 and "'-' is not the name of a file" in err and not Path("-").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("lut", "interior-2k2", "-o", "t.csv"), "'t.csv' ends in .csv; what is written is .npz"),
+        (("lut", "interior-2k2", "-o", "t.npz", "--plot", "t.xyz"), "t.xyz has no figure format"),
+        (("tune", "interior-2k2", "-o", "t.json"), "'t.json' ends in .json; what is written is .toml"),
+        (("-b", "500k", "scan"), "'500k' is no whole number (decimal or 0x...); did you mean 500000?"),
+    ],
+)
+def test_a_name_or_number_in_another_form_is_refused(tool: Tool, arguments: tuple[str, ...], said: str) -> None:
+    """Before, ``lut -o t.csv`` overwrote its own table, and one of 4 MB was made before ``t.xyz`` was looked at."""
+    code, _, err = tool(*arguments)
+    assert code == 2 and said in err and not list(Path().glob("t.*"))
+
+
+def test_where_no_server_was_found_is_told() -> None:
+    """Before, "Connection refused": a drive served at another port is another line of a file."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with pytest.raises(BusError) as caught:
+        connect("socketcand", "vcan0", host="127.0.0.1", port=port)
+    assert f"no server listens at 127.0.0.1:{port}" in str(caught.value) and "can.conf" in caught.value.likely
 
 
 def test_a_served_drive_on_another_port_is_joined_by_a_file_that_python_can_reads() -> None:

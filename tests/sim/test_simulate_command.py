@@ -75,7 +75,7 @@ def test_duration_and_scenario_file(tmp_path):
         (("-o", "t.npz"), "which --scenario"),
         (("--scenario", "q-step", "-o", "t.xlsx"), "no trace format"),
         (("--scenario", "q-step", "-o", "t.npz", "--plot", "t.gif"), "figure format"),
-        (("--scenario", "no-step", "-o", "t.npz"), "did you mean"),
+        (("--scenario", "no-step"), "did you mean"),
         (("--scenario", "q-step", "--json", "--set", "seed"), "not KEY=VALUE"),
         (("--scenario", "q-step", "--json", "--set", "adc_bits=many"), "adc_bits"),
         (("--scenario", "q-step", "--json", "--duration", "20"), "has no unit"),
