@@ -143,14 +143,6 @@ def driven_flux_linkage(
         FLOOR * value,
         tolerance.voltage_scale_std * value,
     )
-    return Estimate(
-        value,
-        std,
-        tolerance.flux * value,
-        "Wb",
-        n=len(pairs),
-        T_c=T_c,
-        method="driven by q currents of both signs",
-        i_d_apk=0.0,
-        i_q_apk=float(np.mean(np.abs(i_q[driven]))),
-    )
+    return Estimate(value, std, tolerance.flux * value, "Wb", n=len(pairs), T_c=T_c,
+                    method="driven by q currents of both signs", i_d_apk=0.0,
+                    i_q_apk=float(np.mean(np.abs(i_q[driven]))))  # fmt: skip

@@ -527,17 +527,8 @@ def normalised(measured: Estimate, copper: Copper, tolerance: SensorTolerance) -
     scale = value / measured.value
     systematic = math.hypot(measured.systematic * scale, unknown * abs(rise) * value)
     systematic = math.hypot(systematic, copper.alpha_per_k * tolerance.temperature_k * value)
-    return Estimate(
-        value=value,
-        std=measured.std * scale,
-        systematic=systematic,
-        unit="ohm",
-        n=measured.n,
-        chi2=measured.chi2,
-        T_c=measured.T_c,
-        method=measured.method,
-        i_d_apk=measured.i_d_apk,
-    )
+    return Estimate(value=value, std=measured.std * scale, systematic=systematic, unit="ohm", n=measured.n,
+                    chi2=measured.chi2, T_c=measured.T_c, method=measured.method, i_d_apk=measured.i_d_apk)  # fmt: skip
 
 
 def _at_reference_ohm(R_ohm: float, copper: Copper, T_c: float) -> float:

@@ -424,6 +424,27 @@ def test_what_repeats_with_the_angle_or_grows_with_the_speed_is_no_friction(effe
     assert found.J.std < 2e-3 * J and found.tau_c.std < 0.01 * 1.2
 
 
+@pytest.mark.chain
+def test_an_encoder_off_centre_by_a_degree_makes_no_friction() -> None:
+    """The current's frame goes with it, and so does the angle that its error is a function of."""
+    truth, pairs = (20.0 * J, B, TAU_C), 6
+    traces = []
+    for trace in run_of(np.random.default_rng(3), truth, bits=24):
+        angle = trace["theta_M_rad"]
+        error = math.radians(1.0) * np.cos(angle + 1.0) + math.radians(0.5) * np.sin(2.0 * angle)
+        i = 1j * trace["i_q_a"] * np.exp(-1j * pairs * error)
+        step = 2.0 * math.pi / 2**18
+        shown = {"theta_M_rad": step * np.round((angle + error) / step), "i_d_a": i.real, "i_q_a": i.imag}
+        traces.append(replace(trace, signals={**trace.signals, **shown}))
+    found = estimate_mechanics(traces, lambda i_d, i_q: PER_A * i_q, PER_A, SIGMA, 1e-6, pole_pairs=pairs)
+    for value, true in zip((found.J, found.B, found.tau_c), truth, strict=True):
+        assert abs(value.value - true) < 3.0 * value.std
+    once, twice = found.harmonics.encoder_rad
+    assert math.degrees(once.amplitude) == pytest.approx(1.0, rel=0.05), "0.027 and 0.022 measured"
+    assert math.degrees(twice.amplitude) == pytest.approx(0.5, rel=0.05)
+    assert found.B.std < 0.01 * B and not found.unexplained
+
+
 def test_friction_that_may_be_more_than_what_turned_the_shaft_is_none() -> None:
     """Behind an elastic shaft with fine cogging a fit ran away: tau_c -2.7e5 +- 8e6 N m, B 1e5 +- 3e6 N m s."""
     n = 20

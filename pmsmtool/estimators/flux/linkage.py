@@ -393,18 +393,14 @@ def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
     value = float(share @ values)
     within = chi / dof * np.array([float(np.sum((hat[0] / weight) ** 2)) for hat in hats])
     low = level < LEVEL_RATIO * sizes[0]
-    return _Even(
-        flux_wb=value,
-        std_wb=math.sqrt(float(share @ (within + (values - value) ** 2))),
-        dof=float(share @ dof),
-        curvature=sum(float(p * np.sum((hat @ y)[1:])) for p, hat in zip(share, hats, strict=True)) / value,
-        low_wb=float(np.average(y[low], weights=weight[low])),
-        low_std_wb=float(np.std(y[low])) / math.sqrt(max(1, int(np.sum(low)) - 1)),
-        low_i_d_a=float(np.mean(level[low])),
-        w=0.5 * w_sum,
-        residual_wb=np.asarray(share @ np.stack(residuals)),
-        row=np.asarray(share @ np.stack([hat[0] for hat in hats]) @ reduce),
-    )
+    return _Even(flux_wb=value, std_wb=math.sqrt(float(share @ (within + (values - value) ** 2))),
+                 dof=float(share @ dof),
+                 curvature=sum(float(p * np.sum((hat @ y)[1:])) for p, hat in zip(share, hats, strict=True)) / value,
+                 low_wb=float(np.average(y[low], weights=weight[low])),
+                 low_std_wb=float(np.std(y[low])) / math.sqrt(max(1, int(np.sum(low)) - 1)),
+                 low_i_d_a=float(np.mean(level[low])), w=0.5 * w_sum,
+                 residual_wb=np.asarray(share @ np.stack(residuals)),
+                 row=np.asarray(share @ np.stack([hat[0] for hat in hats]) @ reduce))  # fmt: skip
 
 
 def _rough_L_d(rows: Corrected, which: NDArray[np.int64]) -> float:

@@ -213,22 +213,12 @@ def estimate_flux_map(
     asymmetry = fit.asymmetry / span
     notes = _notes(fit, asymmetry, skew, radius, i_max)
     meta = _meta(fit, traces, radius, misfit, asymmetry, skew, notes)
-    return FluxMapResult(
-        flux_map=FluxMap(axis_d, axis_q, psi[0].reshape(shape), psi[1].reshape(shape), meta=meta),
-        identified=known.reshape(shape),
-        psi_std_wb=std.reshape(2, *shape),
-        L_h=L.reshape(3, *shape),
-        L_std_h=np.where(known, fit.inductance_std(i_d, i_q), math.nan).reshape(3, *shape),
-        radius_a=radius,
-        span_wb=span,
-        misfit=misfit,
-        asymmetry=asymmetry,
-        skew=skew,
-        fit=fit,
-        systematic_flux=tolerance.flux,
-        systematic_current=tolerance.current_gain,
-        notes=notes,
-    )
+    return FluxMapResult(flux_map=FluxMap(axis_d, axis_q, psi[0].reshape(shape), psi[1].reshape(shape), meta=meta),
+                         identified=known.reshape(shape), psi_std_wb=std.reshape(2, *shape), L_h=L.reshape(3, *shape),
+                         L_std_h=np.where(known, fit.inductance_std(i_d, i_q), math.nan).reshape(3, *shape),
+                         radius_a=radius, span_wb=span, misfit=misfit, asymmetry=asymmetry, skew=skew, fit=fit,
+                         systematic_flux=tolerance.flux, systematic_current=tolerance.current_gain,
+                         notes=notes)  # fmt: skip
 
 
 def _check_pulses(traces: Sequence[Trace]) -> None:

@@ -22,14 +22,14 @@ turns does not show these; all four traces together do.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import legendre
 
 from pmsmtool.arrays import Array
-from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS
+from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS, Harmonic
 
 TILT_FLOOR = 2e-3
 """Relative deviation of the pushes' torque at their fastest speed, beyond that of the samples' displacement. Fits of
@@ -115,4 +115,14 @@ def disturbances(theta: Array, torque: Array, T: float, extent: Extent, pole_pai
     return Disturbances(
         np.column_stack([*torques, np.zeros((blocks, len(positions)))]),
         np.column_stack([np.zeros((blocks + 1, len(torques))), *positions]),
+    )
+
+
+def encoder_errors(sizes: Array, known: Sequence[Harmonic]) -> tuple[Harmonic, ...]:
+    """Return the encoder's error: what is known of it, and what sizes of the shapes, a fit's last, add."""
+    pairs = ENCODER_STD_RAD * sizes[-2 * len(ENCODER_ORDERS) :].reshape(-1, 2)
+    found = dict.fromkeys(ENCODER_ORDERS, (0.0, 0.0, 0.0)) | {h.order: (h.cosine, h.sine, h.std) for h in known}
+    return tuple(
+        Harmonic(order, found[order][0] + float(c), found[order][1] + float(s), found[order][2])
+        for order, (c, s) in zip(ENCODER_ORDERS, pairs, strict=True)
     )
