@@ -51,7 +51,8 @@ TIMING_COVERAGE = 2.0
 """Half range of identified lag and instant, of their standard deviation."""
 OFFSET_SHARE = 0.001
 MISMATCH = 0.002
-"""Standard deviations of sensor offsets (of I_max) and of the phases' gains against each other."""
+"""Standard deviations of sensor offsets (of I_max) about what they show before the proof, and of the phases' gains
+against each other."""
 SEEN_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
 """Range of identified eddy currents, drag, cogging, encoder errors and ripple of the link, and factor either way of the
 currents' time constant: one branch stands for many, one order for the orders of the cogging."""
@@ -100,7 +101,7 @@ def draw_machine(
         setup.U_dc_ripple *= float(rng.uniform(*SEEN_SHARES))
         setup.U_dc_ripple_hz = float(rng.choice(RIPPLE_HZ))
     setup.sensors.encoder_offset_e += varied["encoder_rad"]
-    setup.sensors.offset[:] = list(rng.normal(0.0, OFFSET_SHARE * I_max, 3))
+    setup.sensors.offset[:] = list(base.sensors.offset + rng.normal(0.0, OFFSET_SHARE * I_max, 3))
     known = [machine.conditions.get(f"sensor_gain_{phase}_over_mean", 1.0) for phase in "abc"]
     setup.sensors.gain[:] = list(rng.normal(1.0, MISMATCH, 3) * np.array(known))
     _draw_eddy_currents(setup, machine, rng)

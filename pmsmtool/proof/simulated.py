@@ -362,6 +362,7 @@ def _simulated(machine: MachineFile, conditions: Conditions) -> MachineFile:
         "T_winding_c": T_winding,
         "T_magnet_c": T_winding if math.isnan(conditions.T_magnet_c) else conditions.T_magnet_c,
         "dead_time_s": min(dead_time, 2e-5),
+        **{f"sensor_offset_{x}_apk": offset for x, offset in zip("abc", conditions.offsets_apk, strict=True)},
     }
     if conditions.U_dc_ripple_v > RIPPLE_LEAST * conditions.U_dc_v:
         settings["U_dc_ripple_v"] = conditions.U_dc_ripple_v

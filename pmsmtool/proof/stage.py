@@ -59,6 +59,8 @@ GROSS = 3.0
 LINK_READINGS = 200
 """Readings of the DC link whose mean counts, 0.1 s and more of a rectifier's ripple: with one reading of 2.2 % of it, a
 healthy drive entered field weakening 1.23 half widths of the band late (the mean: within 0.2 %)."""
+OFFSET_READINGS = 32
+"""Readings of each phase's current before the bridge is on: their mean is the offset that the sensor has now."""
 LOWEST_LINK = 0.05
 """Quantile of a record that is the link under load: its noise is not."""
 LINK_KEPT = 0.87
@@ -286,9 +288,12 @@ def conditions_of(drive: CanopenDrive, envelope: Envelope) -> Conditions:
             return math.nan
 
     link = [drive.live("U_dc_v") for _ in range(LINK_READINGS)]
+    shown = [statistics.fmean(live(f"i_{phase}_a") for _ in range(OFFSET_READINGS)) for phase in "abc"]
+    offsets = [offset - statistics.fmean(shown) if math.isfinite(sum(shown)) else 0.0 for offset in shown]
     return Conditions(
         statistics.fmean(link), live("T_winding_c"), live("T_magnet_c"), counts,
         envelope.i_max_apk, envelope.speed_max_rad_s, envelope.shaft, math.sqrt(2.0) * statistics.pstdev(link),
+        (offsets[0], offsets[1], offsets[2]),
     )  # fmt: skip
 
 

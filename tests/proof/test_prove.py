@@ -281,11 +281,14 @@ def test_a_supply_that_gives_way_bounds_the_power_of_a_proof(design: Design) -> 
     assert [line for line in _beyond(design, below) if line.endswith("(the envelope of the proof): NOT CHECKED")]
 
 
-def test_the_link_is_known_beside_its_ripple(design: Design) -> None:
-    """One reading of 12 V of ripple was up to 2.2 % off, and the prediction began to weaken the field elsewhere."""
+def test_the_link_beside_its_ripple_and_what_sensors_show_without_current_are_known(design: Design) -> None:
+    """One reading of 12 V of ripple was up to 2.2 % off, and the prediction began to weaken the field elsewhere.
+
+    A sensor that had drifted by 0.15 of 5 A failed a healthy drive: the offset of before identification was drawn.
+    """
     allowed = stages.envelope_of(design, FEW)
     for hz in (100.0, 300.0, 360.0):
-        ripple = {"U_dc_ripple_v": 12.0, "U_dc_ripple_hz": hz}
+        ripple = {"U_dc_ripple_v": 12.0, "U_dc_ripple_hz": hz, "sensor_offset_a_apk": 0.15}
         Path("drive.toml").write_text(dump_machine_file(replace(machine(), simulation=ripple)))
         with connect("pmsmsim", "drive.toml?nv=:memory:") as connection:
             drive = CanopenDrive(connection, 1)
@@ -294,6 +297,7 @@ def test_the_link_is_known_beside_its_ripple(design: Design) -> None:
             found = stages.conditions_of(drive, allowed)
             assert found.U_dc_v == pytest.approx(540.0, rel=0.002)
             assert found.U_dc_ripple_v == pytest.approx(12.0, rel=0.1)
+            assert found.offsets_apk == pytest.approx((0.1, -0.05, -0.05), abs=0.01)  # 0.002 measured
 
 
 def test_a_shaft_that_is_held_is_named(design: Design) -> None:

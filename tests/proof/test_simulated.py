@@ -19,6 +19,16 @@ from pmsmtool.resources import data_folder
 pytestmark = pytest.mark.chain
 
 
+def test_offsets_are_drawn_about_what_the_sensors_show() -> None:
+    base = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
+    design = tune(base, TuneRequest(field_weakening="off"))
+    conditions = Conditions(540.0, math.nan, math.nan, 2**17, 10.0, 300.0, offsets_apk=(0.3, -0.2, -0.1))
+    drives = SimulatedDrives(design, conditions, plan_proof(design, conditions), 16, seed=0)
+    drawn = np.array([list(setup.sensors.offset) for setup in drives.setups])
+    np.testing.assert_allclose(drawn.mean(axis=0), conditions.offsets_apk, atol=0.02)  # 0.004 measured
+    assert 0.0 < np.std(drawn, axis=0).max() < 0.05
+
+
 def test_what_holds_the_shaft_before_a_move_is_drawn_anew_before_the_next() -> None:
     """With one draw for both, a friction that held both alike cancelled: a healthy drive came to 131 % of a band."""
     base = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
