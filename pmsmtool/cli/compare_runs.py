@@ -4,16 +4,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.options import FILE, examples, output_options
+from pmsmtool.cli.options import FILE, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, figure_format, save_figure, table
-
-if TYPE_CHECKING:
-    from pmsmtool.machine.machine_file import MachineFile
-    from pmsmtool.run_directory import RunRecord
 
 
 @click.command(
@@ -26,10 +21,13 @@ if TYPE_CHECKING:
 @click.argument("first", type=click.Path(path_type=Path))
 @click.argument("second", type=click.Path(path_type=Path))
 @click.option("--check", is_flag=True, help="Exit code 1 where a value differs beyond its interval, or one is missing.")
+@click.option("--tol", type=Quantity("ratio"), help="Limit in place of the intervals, e.g. 2%; of parameters, too.")
 @click.option("--plot", "plot_path", type=FILE, help="Differences over their intervals to write (.svg, .png, .pdf).")
 @output_options
-def diff_command(first: Path, second: Path, check: bool, plot_path: Path | None, out: Output) -> None:
-    """Compare what two runs identified, with the 95 % interval of the difference.
+def diff_command(
+    first: Path, second: Path, check: bool, tol: float | None, plot_path: Path | None, out: Output
+) -> None:
+    """Compare what two runs identified, with the 95 % interval of the difference; their verdicts and parameters.
 
     Runs of one drive share its sensors, so only what scatters counts; of two drives the whole interval does. Resistance
     and flux linkage are compared at their reference temperature, with what the way there leaves open.
@@ -37,9 +35,13 @@ def diff_command(first: Path, second: Path, check: bool, plot_path: Path | None,
     Of two runs of `pmsmtool move`: following error, settling and current of the same move, number by number. The exit
     code with --check is then 1 where the second one follows worse.
     """
+    from pmsmtool.commissioning.report_page import verdict
     from pmsmtool.errors import CheckFailed, ConfigError
-    from pmsmtool.identification.compared_runs import differences, same_drive, told
+    from pmsmtool.identification.compared_runs import differences, other_parameters, same_drive, told, within
+    from pmsmtool.identification.run_files import read_run
 
+    if tol is not None and not 0.0 <= tol < 1.0:
+        raise click.UsageError(f"--tol is {100.0 * tol:g} %; give it as a share or with its unit, e.g. 2%")
     if plot_path is not None:
         figure_format(plot_path)
     if _moved(first, second):
@@ -50,13 +52,26 @@ def diff_command(first: Path, second: Path, check: bool, plot_path: Path | None,
     (record, file), (other_record, other) = read_run(first), read_run(second)
     same = same_drive(record.drive, other_record.drive)
     rows = differences(file.estimates, other.estimates, same_sensors=same, machine=file.machine)
+    rows = rows if tol is None else within(rows, tol)
     cells = [(*told(row), row.verdict) for row in rows]
     changed = [row.name for row in rows if row.verdict != "agrees"]
-    last = f"{len(rows) - len(changed)} of {len(rows)} quantities agree"
-    last += " (one drive: without its sensors' part)" if same else " (two drives: with the sensors' part)"
+    alone = sum("only" in row.verdict for row in rows)
+    last = f"{len(rows) - len(changed)} of {len(rows) - alone} quantities agree"
+    if tol is None:
+        last += " (one drive: without its sensors' part)" if same else " (two drives: with the sensors' part)"
+    last += f"; {alone} in one run alone" if alone else ""
+    words = [verdict(path).word for path in (first, second)]
+    sets = other_parameters(first, second, tol or 0.0)
+    lines = [last, f"verdict: {' -> '.join(words)}"]
+    if sets is not None:
+        more = "; `pmsmtool param diff FIRST SECOND` lists them" if sets else ""
+        lines.append(f"parameters: {len(sets)} differ{more}")
+    if words[0] != words[1]:
+        changed.append("verdict")
     data = [{**_facts(row), "verdict": row.verdict} for row in rows]
-    heads = ("quantity", "first", "second", "difference", "interval", "verdict")
-    out.result("diff", {"same_drive": same, "quantities": data}, [*table(heads, cells), last])
+    heads = ("quantity", "first", "second", "difference", "interval" if tol is None else "limit", "verdict")
+    facts = {"same_drive": same, "quantities": data, "verdicts": words, "parameters": sets}
+    out.result("diff", facts, [*table(heads, cells), *lines])
     if plot_path is not None:
         from pmsmtool.report.figures import difference_figure
 
@@ -118,19 +133,3 @@ def _facts(row: object) -> dict[str, object]:
     from dataclasses import asdict
 
     return asdict(row)  # type: ignore[call-overload,no-any-return]
-
-
-def read_run(path: Path) -> tuple[RunRecord, MachineFile]:
-    """Return the record of a run and the machine it identified; raises ``ConfigError`` where it identified none."""
-    from pmsmtool.errors import ConfigError
-    from pmsmtool.identification.run_files import MACHINE
-    from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.run_directory import RunDirectory
-
-    record = RunDirectory(path).read()
-    if not (path / MACHINE).is_file():
-        raise ConfigError(
-            f"the run has no {MACHINE}: nothing was identified", where=str(path),
-            hint="`pmsmtool report RUN` says how it ended",
-        )  # fmt: skip
-    return record, load_machine_file(path / MACHINE)

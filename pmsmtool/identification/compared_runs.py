@@ -7,6 +7,7 @@ import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from pmsmtool.estimators.estimate import (
@@ -18,6 +19,8 @@ from pmsmtool.estimators.estimate import (
 )
 from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.machine.temperature import UNKNOWN_T_RANGE_C, WINDING_TOLERANCE, magnet_tolerance_per_k
+from pmsmtool.params.parameter_set import Difference as ParameterDifference
+from pmsmtool.params.parameter_set import compare, read_parameter_set
 from pmsmtool.units import format_quantity
 
 LEAST_SERIES = 5
@@ -99,6 +102,19 @@ def differences(
     count = max(1, sum(row.interval > 0.0 for row in rows))
     wider = statistics.NormalDist().inv_cdf(1.0 - 0.025 / count) / COVERAGE_FACTOR
     return [replace(row, interval=wider * row.interval) for row in rows]
+
+
+def within(rows: Iterable[Difference], share: float) -> list[Difference]:
+    """Return the rows with a share of the first value as limit, in place of the interval."""
+    return [row if row.first is None else replace(row, interval=share * abs(row.first)) for row in rows]
+
+
+def other_parameters(first: Path, second: Path, share: float) -> list[ParameterDifference] | None:
+    """Return the parameters of two runs' sets that differ by more than a share; None where a run has no set."""
+    files = [path / "params.toml" for path in (first, second)]
+    if not all(file.is_file() for file in files):
+        return None
+    return [row for row in compare(*map(read_parameter_set, files)) if not abs(row.relative) <= share]
 
 
 def thermal_half_width(name: str, first: Estimate, second: Estimate, machine: MachineParameters) -> float:

@@ -11,7 +11,8 @@ from typing import Any
 
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.files import make_folder
-from pmsmtool.run_directory import RunDirectory
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.run_directory import RunDirectory, RunRecord
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 
@@ -23,6 +24,18 @@ _MADE_FROM_MACHINE = ("design.toml", "params.toml")
 PREDICTED = "predicted.json"
 """What was said before the machine moved."""
 SCHEMA = "pmsmtool.predicted/1"
+
+
+def read_run(path: Path) -> tuple[RunRecord, MachineFile]:
+    """Return the record of a run and the machine it identified; raises ``ConfigError`` where it identified none."""
+    record = RunDirectory(path).read()
+    if not (path / MACHINE).is_file():
+        raise ConfigError(
+            f"the run has no {MACHINE}: nothing was identified",
+            where=str(path),
+            hint="`pmsmtool report RUN` says how it ended",
+        )
+    return record, load_machine_file(path / MACHINE)
 
 
 def entry(before: str, relative_std: Mapping[str, float], **more: object) -> dict[str, Any]:

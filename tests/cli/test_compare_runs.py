@@ -18,7 +18,8 @@ from pmsmtool.identification.compared_runs import LEAST_SERIES, differences, dri
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.run_directory import RunDirectory, RunRecord
+from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.run_directory import RunDirectory, RunRecord, Stage
 
 R = Estimate(0.5, 0.001, 0.005, "ohm", T_c=25.0)
 PSI = Estimate(0.1, 0.0001, 0.001, "Wb", T_c=25.0)
@@ -108,8 +109,27 @@ def test_two_runs_on_the_command_line(tmp_path: Path) -> None:
     assert isinstance(outcome.exception, CheckFailed) and "R_s_ohm" in str(outcome.exception)
     assert "1 of 2 quantities agree" in outcome.stdout
     assert CliRunner().invoke(cli, ["diff", str(first), str(first), "--check"]).exit_code == 0
+    assert CliRunner().invoke(cli, ["diff", str(first), str(second), "--check", "--tol", "3%"]).exit_code == 0
+    assert CliRunner().invoke(cli, ["diff", str(first), str(second), "--check", "--tol", "1%"]).exit_code == 1
+    assert CliRunner().invoke(cli, ["diff", str(first), str(second), "--tol", "5"]).exit_code == 2
     outcome = CliRunner().invoke(cli, ["diff", str(first), str(tmp_path)])
     assert isinstance(outcome.exception, ConfigError) and "run.json" in str(outcome.exception)
+
+
+def test_verdicts_and_parameters_of_two_runs_are_compared(tmp_path: Path) -> None:
+    """A quantity that one run alone has is no quantity that disagrees; the verdict and the set were not looked at."""
+    first = run_of(tmp_path, "a", {"R_s_ohm": R, "psi_f_wb": PSI})
+    second = run_of(tmp_path, "b", {"R_s_ohm": R})
+    for path, gain in ((first, 10.0), (second, 10.3)):
+        values = {"current.K_p_d_v_per_a": gain, "current.K_p_q_v_per_a": 20.0}
+        (path / "params.toml").write_text(ParameterSet(values).to_toml())
+    RunDirectory(second).add(Stage("identify", "fail", 1.0, note="too noisy"))
+    outcome = CliRunner().invoke(cli, ["diff", str(first), str(second), "--check"])
+    assert "1 of 1 quantities agree (one drive: without its sensors' part); 1 in one run alone" in outcome.stdout
+    assert " -> FAIL\nparameters: 1 differ; `pmsmtool param diff" in outcome.stdout
+    assert "psi_f_wb, verdict: not the same" in str(outcome.exception)
+    assert [row["name"] for row in told("diff", first, second)["parameters"]] == ["current.K_p_d_v_per_a"]  # type: ignore[attr-defined]
+    assert told("diff", first, second, "--tol", "5%")["parameters"] == []
 
 
 def test_a_folder_of_runs_names_the_one_that_stands_out(tmp_path: Path) -> None:
