@@ -66,6 +66,9 @@ def report_command(
         raise click.UsageError("--anonymous, --junit, --pdf and --follow exclude each other: give one of them")
     if (follow and path) or (not follow and (seconds or port)):
         raise click.UsageError("--for and --port belong to --follow, which writes no file (-o)")
+    kind = ".json" if anonymous else ".xml" if junit else ".html"
+    if path is not None and path.suffix.lower() not in ("", kind):
+        raise click.UsageError(f"{path.name}: what is written is {kind}; --pdf writes a .pdf beside the page")
     if follow:
         _follow(run, seconds, port, out)
         return

@@ -135,6 +135,8 @@ def test_a_dash_is_no_file(tool: Tool) -> None:
         (("lut", "interior-2k2", "-o", "t.csv"), "'t.csv' ends in .csv; what is written is .npz"),
         (("lut", "interior-2k2", "-o", "t.npz", "--plot", "t.xyz"), "t.xyz has no figure format"),
         (("tune", "interior-2k2", "-o", "t.json"), "'t.json' ends in .json; what is written is .toml"),
+        (("report", ".", "-o", "t.pdf"), "t.pdf: what is written is .html; --pdf writes a .pdf beside the page"),
+        (("report", ".", "--junit", "-o", "t.json"), "t.json: what is written is .xml"),
         (("-b", "500k", "scan"), "'500k' is no whole number (decimal or 0x...); did you mean 500000?"),
     ],
 )
