@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -379,3 +380,25 @@ def test_on_a_phone_no_part_is_wider_than_the_screen(made: Path, tmp_path: Path)
     found = in_a_frame(tmp_path, page, 390.0 * 25.4 / 96.0, f"`${{{root}.scrollWidth}} ${{{root}.clientWidth}}`")
     wide, seen = map(int, found.split())
     assert wide <= seen <= 390
+
+
+AXE = Path(os.environ.get("PMSMTOOL_AXE", "axe.min.js"))
+"""The script of the package axe-core (Deque Systems), where somebody has it."""
+
+
+@pytest.mark.chain
+@pytest.mark.skipif(find_browser() is None, reason="no browser on this computer")
+@pytest.mark.skipif(not AXE.is_file(), reason="no axe-core: PMSMTOOL_AXE names its axe.min.js")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_core_finds_nothing_serious(made: Path, tmp_path: Path, scheme: str) -> None:
+    page = page_with_values(RunDirectory(shutil.copytree(made, tmp_path / "run")))
+    page = page.replace("screen and (prefers-color-scheme: dark)", "screen" if scheme == "dark" else "speech")
+    (tmp_path / "axe.js").write_bytes(AXE.read_bytes())
+    found = in_a_frame(
+        tmp_path, page.replace("</head>", '<script src="axe.js"></script></head>'), 210.0,
+        "'waiting'; event.target.contentWindow.axe.run(page).then(seen => {"
+        "document.getElementById('out').textContent = `${seen.passes.length} `"
+        "+ seen.violations.map(each => `${each.impact} ${each.id}`).join('|') })",
+    )  # fmt: skip
+    passed, _, wrong = found.partition(" ")
+    assert int(passed) > 15 and not re.search("serious|critical", wrong), found
