@@ -159,13 +159,14 @@ def bode_figure(loops: Mapping[str, SampledLoop], found: Mapping[str, LoopMargin
         Their margins.
     """
     canvas, (upper, lower) = _canvas(2, 1, height=1.5, sharex=True)
-    for (name, loop), colour in zip(loops.items(), _colours(len(loops)), strict=True):
+    for k, ((name, loop), colour) in enumerate(zip(loops.items(), _colours(len(loops)), strict=True)):
         nyquist = math.pi / loop.T_s
         omega = np.geomspace(1e-3 * nyquist, 0.999 * nyquist, BODE_POINTS)
         response = loop.at(omega)
         hz = omega / (2.0 * math.pi)
-        upper.loglog(hz, np.abs(response), color=colour, label=name)
-        lower.semilogx(hz, np.degrees(np.unwrap(np.angle(response))), color=colour)
+        dashes = "--" if k % 2 else "-"  # those of d and q often lie on each other
+        upper.loglog(hz, np.abs(response), dashes, color=colour, label=name)
+        lower.semilogx(hz, np.degrees(np.unwrap(np.angle(response))), dashes, color=colour)
         crossing = found[name].crossover_rad_s
         if math.isfinite(crossing):
             angle = -180.0 + found[name].phase_margin_deg
@@ -310,7 +311,7 @@ def bands_figure(groups: Mapping[str, Mapping[str, tuple[float, float, float, fl
             if math.isfinite(limit):
                 axes.plot([limit, limit], [y - 0.35, y + 0.35], color=_MODEL)
         axes.set_yticks(range(len(rows)), list(rows))
-        axes.set(xlabel=unit, ylim=(len(rows) - 0.5, -0.5))
+        axes.set(xlabel="share" if unit == "1" else unit, ylim=(len(rows) - 0.5, -0.5))
     return _finished(canvas, caption)
 
 
@@ -331,6 +332,10 @@ def margin_figure(report: MarginReport) -> Figure:
     return bands_figure(groups, "")
 
 
+FAR_OUT = 20.0
+"""Half widths beyond which the axis of a difference is logarithmic."""
+
+
 def difference_figure(rows: Mapping[str, tuple[float, float]], caption: str) -> Figure:
     """Draw differences of two runs over the half widths of their 95 % intervals: inside -1 to 1 they agree.
 
@@ -347,6 +352,8 @@ def difference_figure(rows: Mapping[str, tuple[float, float]], caption: str) -> 
     edge = 1.1 * max(1.5, *(abs(share) for share in shares.values()))
     axes.set_yticks(range(len(rows)), list(rows))
     axes.set(xlabel="second minus first / half width of the 95 % interval", xlim=(-edge, edge))
+    if edge > FAR_OUT:  # one that is far out would put all others on one line
+        axes.set_xscale("symlog", linthresh=2.0)
     axes.set_ylim(len(rows) - 0.5, -0.5)
     return _finished(canvas, caption)
 

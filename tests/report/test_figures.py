@@ -126,6 +126,13 @@ def test_a_difference_beyond_its_interval_lies_outside_the_band(canvases: list[A
     assert len({line.get_color() for line in axes.lines}) == 2 and axes.get_xlim() == pytest.approx((-5.5, 5.5))
 
 
+def test_one_difference_far_out_leaves_the_others_apart(canvases: list[Any]) -> None:
+    figures.difference_figure({"offset_rad": (5.0, 0.005), "L_d_h": (-0.5, 0.1)}, "")
+    (axes,) = canvases[0].axes
+    inside, out = (axes.transData.transform((x, 0.0))[0] for x in (0.0, -5.0))
+    assert inside - out > 0.1 * axes.bbox.width
+
+
 def test_text_stays_text_and_no_date_is_written(canvases: list[Any]) -> None:
     inside, beyond = (np.array([-0.5, 0.0]), np.array([0.5, 0.0])), (np.array([-9.0, -8.0]), np.array([5.0, 4.0]))
     figure = figures.envelope_figure(
