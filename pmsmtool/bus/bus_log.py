@@ -56,7 +56,7 @@ class BusLog:
         self.path, self.left_out, self.first_wrong = path, 0, ""
         if path.suffix.lower() not in (*TEXT, *BINARY):
             raise ConfigError(
-                f"{path.suffix or 'no suffix'} is no format of a bus log", where=str(path),
+                f"{path.suffix or 'a name without suffix'} is no format of a bus log", where=str(path),
                 hint=f"name it by its format: {', '.join((*TEXT, *BINARY))} (candump -L writes .log)",
             )  # fmt: skip
         try:
