@@ -146,7 +146,7 @@ def _check(signals: tuple[str, ...], path: Path | None) -> None:
 
     for pattern in signals:
         if not any(fnmatchcase(name, pattern) for name in LIVE):
-            near = get_close_matches(pattern, LIVE, n=1)
+            near = get_close_matches(pattern, LIVE, n=1, cutoff=0.5)  # iq
             hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(LIVE)}"
             raise ConfigError(f"no live quantity is called {pattern}", where="SIGNAL", hint=hint)
     if path is not None and path.suffix.lower() not in (".npz", ".csv"):

@@ -205,7 +205,8 @@ def logged_values(
     present = nodes_in(frames)
     if node is None and len(present) != 1:
         what = f"{len(present)} nodes are in the log" if frames else "there is no CAN frame in the file"
-        hint = f"name one: -n {', -n '.join(map(str, present))}" if present else "record one with --trace-can FILE"
+        nothing = "record one with --trace-can FILE, or by candump -L"
+        hint = f"name one: -n {', -n '.join(map(str, present))}" if present else nothing
         raise ConfigError(what, where=where, hint=hint)
     drive = LoggedDrive(present[0] if node is None else node, named, sheet)
     taken = ((frame.t_s, drive.take(frame)) for frame in frames)

@@ -35,6 +35,7 @@ TERMINAL = 80
         ("simulate interior-2k2 --scenario sped-ramp --json", "speed-ramp"),
         ("reproduce closed-drve", "closed-drive"),
         ("lut interor-2k2 -o lut.npz", "interior-2k2"),
+        ("scope --sim interior-2k2 iq --plain --for 1s", "i_q_a"),
     ],
 )
 def test_a_misspelt_name_is_recognised(typed: str, meant: str, capsys: pytest.CaptureFixture[str]) -> None:
