@@ -57,7 +57,8 @@ if TYPE_CHECKING:
 @click.option("--damping", type=float, default=1.0, help="Damping of second-order.")
 @click.option("--phase-margin-deg", type=DEG, default=45.0, metavar="DEG", help="Least phase margin, with delay.")
 @click.option("--gain-margin-db", type=DB, default=6.0, metavar="DB", help="Least gain margin.")
-@click.option("--predictor/--no-predictor", default=False, help="One-step prediction of the current.")
+@click.option("--predictor/--no-predictor", default=None, help="One-step prediction of the current.  [default: where "
+              "the rotor turns by more than 0.1 rad in a period at base speed]")  # fmt: skip
 @click.option(
     "--speed-method",
     type=click.Choice(["symmetric-optimum", "pole-placement"]),

@@ -206,10 +206,9 @@ def _k_max(found: Horizon | None) -> DesignValue:
 def _options(mode: str, predictor: bool, fast: bool) -> tuple[int, str]:
     row = (CURRENT_ROW, "current row"), (PRE_PROJECTION, "pre-projection")
     steered = () if fast else ((MINIMUM_TIME, "minimum-time direction"),)
-    chosen = {"line": row, "best": (*row, *steered)}.get(mode, ())
-    bits = sum(bit for bit, _ in chosen) | (PREDICTOR if predictor and mode != "off" else 0)
-    names = [name for _, name in chosen] + (["predictor"] if bits & PREDICTOR else [])
-    how = ", ".join(names) or "none"
+    ahead = ((PREDICTOR, "predictor"),) if predictor and mode != "off" else ()
+    chosen = (*{"line": row, "best": (*row, *steered)}.get(mode, ()), *ahead)
+    bits, how = sum(bit for bit, _ in chosen), ", ".join(name for _, name in chosen) or "none"
     if mode == "best" and fast:
         how += f"; no minimum-time direction: a period moves the current by more than {STEERED_STEP:g} I_max"
     return bits, how

@@ -54,6 +54,10 @@ ACCELERATION_SHARE = 0.8
 """Slope limit of the speed reference: this share of what the largest torque can accelerate."""
 FW_SHARE = 0.8
 """And at most this share of the slope at which field weakening falls behind by the whole voltage reserve."""
+PREDICTED_TURN = 0.1
+"""rad that the rotor turns in a period at base speed. Beyond it decoupling by the sampled current comes so late that steps
+of drawn machines left 1.05 I_max, 1.10 at most, and 1.02 with the predictor (docs/control.md, section 7).
+"""
 _CURRENT_OPTIONS = 0b111
 _PREDICTOR_OPTION = 1 << 4
 
@@ -83,6 +87,10 @@ def tune(source: MachineFile | str | Path, request: TuneRequest | None = None) -
     rated = ratings(source, V_limit, request.overspeed_protection)
     values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}
     values |= rating_values(source, rated)
+    if request.predictor is None:
+        turn = rated.base_speed_rpm / RPM * source.machine.pole_pairs * source.inverter.T_s
+        delayed = source.inverter.delay_periods >= 1.0 and request.controller == "pi"
+        request = replace(request, predictor=delayed and turn > PREDICTED_TURN)
     told = (*implausible(source.machine, source.inverter), *filter(None, (rated.reaction.note,)))
     n_ucg = rated.reaction.generation_rpm
     generation = {} if math.isinf(n_ucg) else {"generation_rpm": n_ucg}
@@ -143,9 +151,6 @@ class _Part:
     notes: tuple[str, ...]
 
 
-# -- current loops -------------------------------------------------------------------------------------------
-
-
 def _design_current(current: CurrentChoice) -> _Part:
     request, alpha = current.request, current.alpha
     how = f"{request.method}, {alpha / (2.0 * math.pi):.5g} Hz{current.why}"
@@ -166,9 +171,6 @@ def _design_current(current: CurrentChoice) -> _Part:
             current.gains(axis), plant, plant if request.predictor else None
         )
     return _Part(values, current.loops(), facts, ())
-
-
-# -- governor and table ----------------------------------------------------------------------------------------
 
 
 def _weakening_mode(source: MachineFile, request: TuneRequest) -> str:
@@ -209,9 +211,6 @@ def _design_table(
         "table_voltage_excess_v": made.error.voltage_v,
     }
     return _Part({name: DesignValue(value, how) for name, value in values.items()}, {}, facts, made.notes), tables
-
-
-# -- speed loop ----------------------------------------------------------------------------------------------
 
 
 def _design_speed(

@@ -39,8 +39,8 @@ class TuneRequest:
         Damping of ``second-order``.
     phase_margin_deg, gain_margin_db : float
         Least margins of the current loops, delay included, and with a flux map at every current up to I_max.
-    predictor : bool
-        One-step prediction of the current (needs a delay of one period or more).
+    predictor : bool or None
+        One-step prediction of the current (needs a delay of a period); None: where the rotor turns ``PREDICTED_TURN``.
     speed_method : str
         ``symmetric-optimum`` or ``pole-placement``.
     speed_bandwidth_hz : float or None
@@ -77,7 +77,7 @@ class TuneRequest:
     damping: float = 1.0
     phase_margin_deg: float = 45.0
     gain_margin_db: float = 6.0
-    predictor: bool = False
+    predictor: bool | None = None
     speed_method: str = "symmetric-optimum"
     speed_bandwidth_hz: float | None = None
     speed_phase_margin_deg: float = 60.0

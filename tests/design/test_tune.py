@@ -151,6 +151,21 @@ def test_second_order_and_predictor_reach_the_parameters() -> None:
         tune(replace(SURFACE, inverter=InverterParameters(210.0, 12e3, delay_periods=0.5)), TuneRequest(predictor=True))
 
 
+@pytest.mark.parametrize(
+    ("f_s_hz", "delay", "controller", "predicts"),
+    [(2400.0, 1.5, "pi", True), (2700.0, 1.5, "pi", False), (2400.0, 0.5, "pi", False), (2400.0, 1.5, "polar", False)],
+)
+def test_a_rotor_that_turns_far_in_a_period_gets_the_predictor(
+    f_s_hz: float, delay: float, controller: str, predicts: bool
+) -> None:
+    """At base speed it turns by 0.108 rad at 2400 Hz, 0.096 at 2700."""
+    source = replace(SURFACE, inverter=InverterParameters(210.0, f_s_hz, delay_periods=delay))
+    request = TuneRequest(controller=controller, bandwidth_hz=60.0)
+    design = tune(source, request)
+    assert bool(int(design["current.options"]) & 16) == design.request["predictor"] == predicts
+    assert not int(tune(source, replace(request, predictor=False))["current.options"]) & 16
+
+
 def test_without_inertia_the_speed_loop_is_off_and_said_so() -> None:
     design = tune(replace(SURFACE, machine=replace(SURFACE.machine, J_kgm2=None)))
     assert design["speed.K_p_nms_per_rad"] == design["speed.K_i_nm_per_rad"] == 0.0
