@@ -61,6 +61,11 @@ def flash_params_command(
 
     drive_map = read_map(map_file)
     wanted = load_parameters(source, drive_map)  # a file that cannot be read needs no bus
+    if (source / "run.json").is_file():
+        from pmsmtool.commissioning.report_page import verdict
+
+        if (found := verdict(source)).word != "PASS":
+            out.warn(f"the run ended so: {found.headline}")
     if nodes is None and (serials or canary):
         raise click.UsageError("--serials and --canary go with --nodes")
     if map_file is None:
@@ -74,14 +79,6 @@ def flash_params_command(
         return
     with set_named() as jobs, open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
         carry_out(
-            node,
-            jobs,
-            wanted,
-            bus,
-            motion,
-            out,
-            command="flash-params",
-            store=not no_store,
-            dry_run=dry_run,
-            check=check,
-        )
+            node, jobs, wanted, bus, motion, out,
+            command="flash-params", store=not no_store, dry_run=dry_run, check=check,
+        )  # fmt: skip

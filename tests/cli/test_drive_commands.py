@@ -24,6 +24,8 @@ from pmsmtool.drive_maps.drive_map_file import dump_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import SdoAbort
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
+from pmsmtool.report.verdict import ENCODER_SIGN
+from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
 from tests.cli.conftest import Result, Tool
 from tests.simulated_bus import settle
@@ -239,6 +241,16 @@ def test_param_help(tool: Tool, capsys: pytest.CaptureFixture[str]) -> None:
 def wanted(tmp_path: Path) -> str:
     (tmp_path / "wanted.toml").write_text(WANTED.to_toml())
     return "wanted.toml"
+
+
+def test_a_set_of_a_run_that_did_not_pass_says_so_first(tool: Tool, tmp_path: Path) -> None:
+    """Gains of a run that found two motor leads swapped were listed like any other's."""
+    record = new_record(["commission"], drive={}, bus={}, versions={}, operator="nobody")
+    made = RunDirectory.create(tmp_path, 1, record)
+    made.save("params.toml", WANTED.to_toml())
+    made.add(Stage("identify", "partial", 1.0, refused={ENCODER_SIGN: "the position falls under positive torque"}))
+    code, out, err = tool("flash-params", str(made.path), "--dry-run")
+    assert code == 0 and "the run ended so: " in err and "encoder sign WRONG" in err and "3 of 3 objects change" in out
 
 
 @pytest.mark.chain
