@@ -90,6 +90,7 @@ typedef struct {
     double magnet_strength;        /* magnet flux and its harmonics over those at T_ref */
     double L_d_inverse, L_q_inverse, iron_factor;
     double iron_drag;              /* N m s/rad, of a rotor that turns without stator current */
+    uint32_t has_harmonics, is_uneven; /* 1: psi_6 to psi_7; L_6, L_imbalance are not all 0 */
     double psi_zero_d, psi_zero_q; /* Wb: flux of the map without current, at T_ref */
     double friction_sign;          /* of the Coulomb torque during this interval: -1, 0, 1 */
     /* rotation over the last interval length and speed, a constant-speed run uses it again */

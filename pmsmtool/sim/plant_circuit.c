@@ -11,7 +11,7 @@ static void find_reluctance(const pmsm_plant *m, const pmsm_point *at, double g[
 {
     if (m->machine.map) {
         double h[2] = {0.0, 0.0}, dh[2], i[2];
-        if (pmsm_has_harmonics(&m->machine))
+        if (m->has_harmonics)
             pmsm_magnet_harmonics(m, at->c, at->s, h, dh);
         const double psi_d = at->c * at->psi_alpha + at->s * at->psi_beta - h[0] - m->psi_shift;
         const double psi_q = at->c * at->psi_beta - at->s * at->psi_alpha - h[1];
@@ -21,7 +21,7 @@ static void find_reluctance(const pmsm_plant *m, const pmsm_point *at, double g[
         g[1] = 0.0;
         g[2] = 0.0;
         g[3] = m->L_q_inverse;
-        if (pmsm_is_uneven(&m->machine)) {
+        if (m->is_uneven) {
             double uneven[3], slope[3];
             pmsm_uneven_reluctance(m, at->c, at->s, uneven, slope);
             g[0] += uneven[0];
@@ -34,6 +34,23 @@ static void find_reluctance(const pmsm_plant *m, const pmsm_point *at, double g[
         g[0] += m->machine.eddy_d;
         g[3] += m->machine.eddy_q;
     }
+}
+
+double pmsm_point_uneven_torque(const pmsm_plant *m, const pmsm_point *at)
+{
+    double sum = 0.0;
+    if (m->has_harmonics) { /* from the co-energy: i . d psi_pm / d theta_e */
+        double h[2], dh[2];
+        pmsm_magnet_harmonics(m, at->c, at->s, h, dh);
+        sum += at->i_d * dh[0] + at->i_q * dh[1];
+    }
+    if (m->is_uneven) { /* from the field energy: -psi' (dg/d theta_e) psi' / 2 */
+        double g[3], dg[3], psi[2];
+        pmsm_uneven_reluctance(m, at->c, at->s, g, dg);
+        pmsm_current_flux(m, at, psi);
+        sum -= 0.5 * (dg[0] * psi[0] + 2.0 * dg[1] * psi[1]) * psi[0] + 0.5 * dg[2] * psi[1] * psi[1];
+    }
+    return sum;
 }
 
 void pmsm_point_leg_voltages(const pmsm_plant *m, const pmsm_supply *supply, const pmsm_point *at, double v[3])
@@ -59,7 +76,7 @@ double pmsm_point_hold_voltage(const pmsm_plant *m, const pmsm_point *at, double
     const double psi_d = c * at->psi_alpha + s * at->psi_beta, psi_q = c * at->psi_beta - s * at->psi_alpha;
     double d_psi_d = c * w_alpha + s * w_beta + omega_e * psi_q;
     double d_psi_q = c * w_beta - s * w_alpha - omega_e * psi_d;
-    if (pmsm_has_harmonics(&m->machine)) {
+    if (m->has_harmonics) {
         double h[2], dh[2];
         pmsm_magnet_harmonics(m, c, s, h, dh);
         d_psi_d -= omega_e * dh[0];
@@ -69,7 +86,7 @@ double pmsm_point_hold_voltage(const pmsm_plant *m, const pmsm_point *at, double
     const double n_d = c * pmsm_leg_alpha[x] + s * pmsm_leg_beta[x], n_q = c * pmsm_leg_beta[x] - s * pmsm_leg_alpha[x];
     double di_d = g[0] * d_psi_d + g[1] * d_psi_q - omega_e * at->i_q;
     double di_q = g[2] * d_psi_d + g[3] * d_psi_q + omega_e * at->i_d;
-    if (pmsm_is_uneven(&m->machine)) {
+    if (m->is_uneven) {
         double uneven[3], slope[3], psi[2];
         pmsm_uneven_reluctance(m, c, s, uneven, slope);
         pmsm_current_flux(m, at, psi);
@@ -136,6 +153,8 @@ void pmsm_plant_start(pmsm_plant *m, double theta_M, double omega_M)
     m->state.omega_load = m->state.omega_M;
     m->L_d_inverse = m->machine.map ? 0.0 : 1.0 / m->machine.L_d;
     m->L_q_inverse = m->machine.map ? 0.0 : 1.0 / m->machine.L_q;
+    m->has_harmonics = m->machine.psi_6 != 0.0 || m->machine.psi_12 != 0.0 || m->machine.psi_7 != 0.0;
+    m->is_uneven = m->machine.L_6 != 0.0 || m->machine.L_imbalance != 0.0;
     m->rotation_h = -1.0;
     m->near.cell = NULL;
     m->u_alpha = m->u_beta = m->iron_alpha = m->iron_beta = 0.0;
@@ -158,7 +177,7 @@ double pmsm_plant_hold_voltage(const pmsm_plant *m, const pmsm_supply *supply, i
 static void zero_current_flux(const pmsm_plant *m, double c, double s, double *psi_d, double *psi_q)
 {
     double h[2] = {0.0, 0.0}, dh[2];
-    if (pmsm_has_harmonics(&m->machine))
+    if (m->has_harmonics)
         pmsm_magnet_harmonics(m, c, s, h, dh);
     *psi_d = (m->machine.map ? m->psi_zero_d + m->psi_shift : m->psi_m) + h[0];
     *psi_q = (m->machine.map ? m->psi_zero_q : 0.0) + h[1];
@@ -169,7 +188,7 @@ void pmsm_plant_emf(const pmsm_plant *m, double emf[3])
     const double c = m->state.cos_e, s = m->state.sin_e, omega_e = m->machine.pole_pairs * m->state.omega_M;
     double psi_d, psi_q, h[2], dh[2] = {0.0, 0.0};
     zero_current_flux(m, c, s, &psi_d, &psi_q);
-    if (pmsm_has_harmonics(&m->machine))
+    if (m->has_harmonics)
         pmsm_magnet_harmonics(m, c, s, h, dh);
     const double u_d = omega_e * (dh[0] - psi_q), u_q = omega_e * (dh[1] + psi_d);
     for (int x = 0; x < 3; x++)

@@ -30,16 +30,6 @@ static inline void pmsm_magnet_harmonics(const pmsm_plant *m, double c, double s
     dh[1] = -6.0 * odd * c6 - 12.0 * psi_12 * c12;
 }
 
-static inline int pmsm_has_harmonics(const pmsm_machine *machine)
-{
-    return machine->psi_6 != 0.0 || machine->psi_12 != 0.0 || machine->psi_7 != 0.0;
-}
-
-static inline int pmsm_is_uneven(const pmsm_machine *machine)
-{
-    return machine->L_6 != 0.0 || machine->L_imbalance != 0.0;
-}
-
 /* What di/dpsi has beside its mean at angle (c, s), as dd, dq, qq, and its derivative with respect to theta_e. Phase a
  * with the share e above the mean is e/2 of the mean in alpha and against it in beta. */
 static inline void pmsm_uneven_reluctance(const pmsm_plant *m, double c, double s, double g[3], double dg[3])
@@ -60,7 +50,7 @@ static inline void pmsm_uneven_reluctance(const pmsm_plant *m, double c, double 
 static inline void pmsm_current_flux(const pmsm_plant *m, const pmsm_point *at, double psi[2])
 {
     double h[2] = {0.0, 0.0}, dh[2];
-    if (pmsm_has_harmonics(&m->machine))
+    if (m->has_harmonics)
         pmsm_magnet_harmonics(m, at->c, at->s, h, dh);
     psi[0] = at->c * at->psi_alpha + at->s * at->psi_beta - h[0] - m->psi_m;
     psi[1] = at->c * at->psi_beta - at->s * at->psi_alpha - h[1];
@@ -72,7 +62,7 @@ static inline void pmsm_find_currents(pmsm_plant *m, pmsm_point *at)
     const double c = at->c, s = at->s;
     double psi_d = c * at->psi_alpha + s * at->psi_beta;
     double psi_q = c * at->psi_beta - s * at->psi_alpha;
-    if (pmsm_has_harmonics(&m->machine)) {
+    if (m->has_harmonics) {
         double h[2], dh[2];
         pmsm_magnet_harmonics(m, c, s, h, dh);
         psi_d -= h[0];
@@ -88,7 +78,7 @@ static inline void pmsm_find_currents(pmsm_plant *m, pmsm_point *at)
     } else {
         at->i_d = (psi_d - m->psi_m) * m->L_d_inverse;
         at->i_q = psi_q * m->L_q_inverse;
-        if (pmsm_is_uneven(&m->machine)) {
+        if (m->is_uneven) {
             double g[3], dg[3];
             pmsm_uneven_reluctance(m, c, s, g, dg);
             at->i_d += g[0] * (psi_d - m->psi_m) + g[1] * psi_q;
@@ -106,20 +96,14 @@ static inline void pmsm_find_currents(pmsm_plant *m, pmsm_point *at)
     at->i_beta = s * at->i_d + c * at->i_q;
 }
 
+/* What harmonics and uneven coils add to flux times current. */
+double pmsm_point_uneven_torque(const pmsm_plant *m, const pmsm_point *at);
+
 static inline double pmsm_air_gap_torque(const pmsm_plant *m, const pmsm_point *at)
 {
     double flux_current = at->psi_alpha * at->i_beta - at->psi_beta * at->i_alpha;
-    if (pmsm_has_harmonics(&m->machine)) { /* from the co-energy: i . d psi_pm / d theta_e */
-        double h[2], dh[2];
-        pmsm_magnet_harmonics(m, at->c, at->s, h, dh);
-        flux_current += at->i_d * dh[0] + at->i_q * dh[1];
-    }
-    if (pmsm_is_uneven(&m->machine)) { /* from the field energy: -psi' (dg/d theta_e) psi' / 2 */
-        double g[3], dg[3], psi[2];
-        pmsm_uneven_reluctance(m, at->c, at->s, g, dg);
-        pmsm_current_flux(m, at, psi);
-        flux_current -= 0.5 * (dg[0] * psi[0] + 2.0 * dg[1] * psi[1]) * psi[0] + 0.5 * dg[2] * psi[1] * psi[1];
-    }
+    if (m->has_harmonics | m->is_uneven)
+        flux_current += pmsm_point_uneven_torque(m, at);
     return 1.5 * m->machine.pole_pairs * flux_current;
 }
 
