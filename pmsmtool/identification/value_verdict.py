@@ -19,7 +19,7 @@ from pmsmtool.identification.sampling import timing_warnings
 from pmsmtool.identification.wiring import SUPPLY, WRONG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.machine.two_masses import SWING, UNSEEN
+from pmsmtool.machine.two_masses import SWING, TORQUE_NOISE, UNSEEN
 from pmsmtool.run_directory import Acceptance
 from pmsmtool.units import format_estimate
 
@@ -163,6 +163,8 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     if evaluation.mechanics is not None:
         if evaluation.mechanics.drag is not None:
             conditions["drag_nms2"] = evaluation.mechanics.drag.value
+        if evaluation.mechanics.unexplained and not evaluation.mechanics.J.fallback:
+            conditions[TORQUE_NOISE] = evaluation.mechanics.ripple
         errors_rad |= {h.order: h.amplitude for h in evaluation.mechanics.harmonics.encoder_rad}
     often = dict(zip(ENCODER_ORDERS, ("once", "twice"), strict=True))
     conditions |= {f"encoder_{often[order]}_rad": error_rad for order, error_rad in errors_rad.items()}

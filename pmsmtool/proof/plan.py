@@ -17,7 +17,7 @@ from pmsmtool.identification.frequency_response import NOTHING, RIGID, SHOWN
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, MEAN_FALLBACK, PLAY_FALLBACK
 from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.machine.two_masses import CERTAIN_ZETA, SWING, UNSEEN, hides_play
+from pmsmtool.machine.two_masses import CERTAIN_ZETA, SWING, TORQUE_NOISE, TORQUE_NOISE_MOST, UNSEEN, hides_play
 from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES
 from pmsmtool.units import RAD_S_PER_RPM
 
@@ -338,6 +338,9 @@ def _unmodelled(design: Design) -> str:
     told = inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK)
     if told or hides_play(machine, CERTAIN_ZETA):
         return "the shaft has play, which nothing predicts"
+    noise = machine.conditions.get(TORQUE_NOISE)
+    if isinstance(noise, float) and noise > TORQUE_NOISE_MOST and machine.machine.resonance_hz is None:
+        return f"{100.0 * noise:.2g} % of the pulses' torque is not that of a rigid shaft: play, or an elastic coupling"
     if SWING in machine.conditions:
         return "torque pulses swing the shaft as no known resonance does: play, or an elastic coupling"
     if UNSEEN in machine.conditions:
