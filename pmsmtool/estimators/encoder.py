@@ -24,9 +24,10 @@ INTEGER_LIMIT = 0.1
 """Largest distance of the count from an integer (docs/identification.md, 3.6)."""
 LINEARITY_LIMIT_RAD = math.radians(30.0)
 """Largest deviation of p theta_M from the imposed angle (electrical): beyond it the rotor slips or sticks."""
-JUMP_LIMIT_RAD = math.radians(90.0)
-"""The same of a rotor that jumps from one cogging position to the next, where nothing better is had: with deviations of
-30 to 70 deg the mean of both directions was 0.0 to 2.4 deg off on five machines with 3 to 10 % of cogging."""
+JUMP_LIMIT_RAD = math.radians(150.0)
+"""The same of a rotor that jumps from one cogging position to the next, or swings, where nothing better is had: with
+deviations of 30 to 70 deg the mean of both directions was 0.0 to 2.4 deg off on five machines with 3 to 10 % of cogging
+(a load of 190 times the rotor swung by 124 deg: its pole pairs, psi and L came out all the same)."""
 COUNTS_SHARE = 0.25
 """Part of the imposed angle that friction leaves a rotor; less is none."""
 MAX_POLE_PAIRS = 64
@@ -177,7 +178,11 @@ def _per_turn(forward: Trace, backward: Trace, pole_pairs: int) -> tuple[float, 
 
 
 def _slope(trace: Trace) -> float:
-    """Imposed electrical angle per measured mechanical angle."""
+    """Imposed electrical angle per measured mechanical angle.
+
+    The measured one is regressed on the imposed one: of a heavy rotor that swings behind its vector by 1.5 rad, the
+    other way round made 3.90 pole pairs of 4.
+    """
     imposed, measured = trace["theta_imposed_rad"], trace["theta_M_rad"]
     centred = measured - np.mean(measured)
     power = float(centred @ centred)
@@ -188,7 +193,9 @@ def _slope(trace: Trace) -> float:
             stage=STAGE,
             likely="locked shaft, too small a current, or an encoder that does not count",
         )
-    return float(centred @ (imposed - np.mean(imposed))) / power
+    turned = imposed - np.mean(imposed)
+    along = float(centred @ turned)
+    return float(turned @ turned) / along if along else math.inf
 
 
 def _wrap(angle: Array) -> Array:

@@ -19,7 +19,7 @@ from pmsmtool.identification.sampling import timing_warnings
 from pmsmtool.identification.wiring import SUPPLY, WRONG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.machine.two_masses import SWING, TORQUE_NOISE, UNSEEN
+from pmsmtool.machine.two_masses import INERTIA, REFUSED, SWING, TORQUE_NOISE, UNSEEN
 from pmsmtool.run_directory import Acceptance
 from pmsmtool.units import format_estimate
 
@@ -159,6 +159,8 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions[SWING] = evaluation.swing_hz
     if evaluation.unseen_hz:
         conditions[UNSEEN] = evaluation.unseen_hz
+    if "mechanics" in request.measured and "J_kgm2" not in evaluation.estimates():
+        conditions[INERTIA] = REFUSED
     errors_rad = dict(evaluation.encoder_errors)
     if evaluation.mechanics is not None:
         if evaluation.mechanics.drag is not None:

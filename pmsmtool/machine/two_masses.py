@@ -42,6 +42,9 @@ SLOWEST_UNSEEN_HZ, FASTEST_UNSEEN_HZ, UNSEEN_TRIED = 20.0, 800.0, 9
 """The same without a response, up to where couplings and gears swing (50 to 800 Hz), and frequencies between."""
 
 
+INERTIA, REFUSED = "shaft_inertia", "refused"
+"""Condition of a machine file: its inertia is the data sheet's, for that of the machine was refused. A load of 190
+times the rotor was predicted to turn 12 times as fast in a speed step as it did."""
 TORQUE_NOISE, TORQUE_NOISE_MOST = "shaft_torque_noise", 0.02
 """Condition of a machine file: torque of pulses, of theirs, that a rigid shaft does not explain, and from where on it
 may be a play: 0.036 and 0.038 with 0.4 and 0.7 degrees that no response showed, at most 0.007 of 16 rigid shafts with

@@ -474,10 +474,12 @@ class Measurement:
             try:
                 found = estimate_encoder(*turns)
             except IdentificationError as error:
-                if error.reason not in OFF_THE_VECTOR or (last and not jumped):
+                if error.reason not in OFF_THE_VECTOR:
                     raise
                 with contextlib.suppress(IdentificationError):
                     jumped.append((estimate_encoder(*turns, JUMP_LIMIT_RAD), turns))
+                if last and not jumped:
+                    raise
                 continue
             if not (last and jumped and beside_the_vector(found, jumped[0][0])):
                 return found

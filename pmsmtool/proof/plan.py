@@ -17,7 +17,15 @@ from pmsmtool.identification.frequency_response import NOTHING, RIGID, SHOWN
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, MEAN_FALLBACK, PLAY_FALLBACK
 from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.machine.two_masses import CERTAIN_ZETA, SWING, TORQUE_NOISE, TORQUE_NOISE_MOST, UNSEEN, hides_play
+from pmsmtool.machine.two_masses import (
+    CERTAIN_ZETA,
+    INERTIA,
+    SWING,
+    TORQUE_NOISE,
+    TORQUE_NOISE_MOST,
+    UNSEEN,
+    hides_play,
+)
 from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES
 from pmsmtool.units import RAD_S_PER_RPM
 
@@ -338,6 +346,8 @@ def _unmodelled(design: Design) -> str:
     told = inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK)
     if told or hides_play(machine, CERTAIN_ZETA):
         return "the shaft has play, which nothing predicts"
+    if INERTIA in machine.conditions:
+        return "the inertia was to be identified, and could not be"
     noise = machine.conditions.get(TORQUE_NOISE)
     if isinstance(noise, float) and noise > TORQUE_NOISE_MOST and machine.machine.resonance_hz is None:
         return f"{100.0 * noise:.2g} % of the pulses' torque is not that of a rigid shaft: play, or an elastic coupling"

@@ -22,7 +22,7 @@ from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.machine.torque import iron_drag
-from pmsmtool.machine.two_masses import PLAY_FACTOR, SWING, TORQUE_NOISE, UNSEEN
+from pmsmtool.machine.two_masses import INERTIA, PLAY_FACTOR, REFUSED, SWING, TORQUE_NOISE, UNSEEN
 from pmsmtool.proof.drawn_machine import EMF_HARMONICS, FRICTION_FACTOR, LAG_SHARES, LATE_SHARE
 from pmsmtool.proof.judgement import LEAST_STEADY_ROWS
 from pmsmtool.proof.plan import LONGEST_S, RPM, SIGNALS, STEPS, WEAKENING_SLOPE, Conditions, _apart, plan_proof
@@ -110,12 +110,14 @@ def test_pulses_that_a_rigid_shaft_does_not_explain_leave_the_speed_unpredicted(
     """Two healthy drives with 0.4 and 0.7 degrees of play that no response showed were at 2.9 and 1.1 of their band."""
     made = design()
 
-    def names(noise: float, **known: float) -> list[str]:
-        machine = replace(made.machine, conditions={**made.machine.conditions, TORQUE_NOISE: noise})
+    def names(noise: float, inertia: str = "", **known: float) -> list[str]:
+        told = {TORQUE_NOISE: noise} | ({INERTIA: inertia} if inertia else {})
+        machine = replace(made.machine, conditions={**made.machine.conditions, **told})
         machine = replace(machine, machine=replace(machine.machine, **known))  # type: ignore[arg-type]
         return [e.name for e in plan_proof(replace(made, machine=machine), conditions(made)).experiments]
 
     assert names(0.036) == ["q_steps", "d_steps", "unreachable"]
+    assert names(0.007, inertia=REFUSED) == names(0.036)  # a load of 190 times the rotor, and its data sheet's inertia
     assert "speed_step" in names(0.007) and "move" in names(0.007)
     assert "speed_step" in names(0.036, resonance_hz=90.0, antiresonance_hz=30.0, resonance_zeta=0.02)
 
