@@ -55,8 +55,8 @@ ACCELERATION_SHARE = 0.8
 FW_SHARE = 0.8
 """And at most this share of the slope at which field weakening falls behind by the whole voltage reserve."""
 PREDICTED_TURN = 0.1
-"""rad that the rotor turns in a period at base speed. Beyond it decoupling by the sampled current comes so late that steps
-of drawn machines left 1.05 I_max, 1.10 at most, and 1.02 with the predictor (docs/control.md, section 7).
+"""rad that the rotor turns in a period at base speed. Beyond it decoupling by the sampled current comes so late that
+steps of drawn machines left 1.05 I_max, 1.10 at most, and 1.02 with the predictor (docs/control.md, section 7).
 """
 _CURRENT_OPTIONS = 0b111
 _PREDICTOR_OPTION = 1 << 4
