@@ -58,6 +58,8 @@ LATE_P95_MS, LATEST_MS = 12.0, 40.0
 """Settling on references out of reach."""
 FORM_SPREAD = 0.15
 """Standard deviation of the logarithm of each constant of a closed form."""
+TRIES = 50_000
+"""Of a machine's steps. Some machines have no speed that holds one current and keeps another out of reach."""
 KINDS = ("linear", "salient", "saturated")
 REQUESTS = {
     "default": TuneRequest(),
@@ -89,6 +91,10 @@ def draw_form(seed: int) -> tuple[BridgeSaturation, MachineFile]:
     return form, replace(draw("saturated", seed), flux_map=saturated_pmsyrm_map(form))
 
 
+Step = tuple[float, tuple[float, float], tuple[float, float]]
+"""Speed (rpm), start and target (A)."""
+
+
 class Steps:
     """Random steps of one machine: speed (rpm), start and target (A)."""
 
@@ -113,9 +119,12 @@ class Steps:
             if self.rated.i_d_min_a <= i[0] <= 0.3 * self.rated.I_max_apk:
                 return i
 
-    def draw(self, reachable: bool) -> tuple[float, tuple[float, float], tuple[float, float]]:
-        """Speed (rpm), start and target."""
-        while True:
+    def draw(self, reachable: bool, count: int) -> list[Step]:
+        """Draw steps; fewer or none where a machine has hardly any or none."""
+        found: list[Step] = []
+        for _ in range(TRIES):
+            if len(found) == count:
+                break
             rpm = float(self.rng.uniform(-1.2, 1.2)) * self.rated.base_speed_rpm
             start, target = self.current(), self.current()
             share = self.voltage(target, rpm)
@@ -125,12 +134,11 @@ class Steps:
                 and self.voltage(start, rpm) <= HELD_SHARE
                 and math.dist(start, target) > 0.2 * self.rated.I_max_apk
             ):
-                return rpm, start, target
+                found.append((rpm, start, target))
+        return found
 
 
-def run(
-    source: MachineFile, params: ParameterSet, step: tuple[float, tuple[float, float], tuple[float, float]]
-) -> tuple[float, float, bool]:
+def run(source: MachineFile, params: ParameterSet, step: Step) -> tuple[float, float, bool]:
     """Return settling (s; the whole time when it does not settle), largest current (A), and whether V_max was passed.
 
     The last: the demanded voltage after the step.
@@ -187,7 +195,7 @@ def main() -> int:
         if asked.second_plant and kind == "saturated":
             form, source = draw_form(1000 * asked.seed + k)
         steps = Steps(source, 1000 * asked.seed + k)
-        cases = [(reachable, steps.draw(reachable)) for reachable in (True, False) for _ in range(asked.steps)]
+        cases = [(reachable, step) for reachable in (True, False) for step in steps.draw(reachable, asked.steps)]
         noise = {"sensor_noise_apk": asked.noise * steps.rated.I_max_apk}
         drive = replace(source, simulation={**source.simulation, **noise})
         sets = {law: tune(source, request).parameter_set() for law, request in REQUESTS.items()}

@@ -24,7 +24,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from benchmarks.default_governor import KINDS, OVER, Steps, draw, run
+from benchmarks.default_governor import KINDS, OVER, Step, Steps, draw, run
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.params.parameter_set import SATURATION, ParameterSet
@@ -43,13 +43,12 @@ def without_table(params: ParameterSet) -> ParameterSet:
     return replace(params, values=values, tables={k: v for k, v in params.tables.items() if k != SATURATION})
 
 
-def hunt(steps: Steps, params: ParameterSet, count: int, hold_s: float) -> float:
+def hunt(steps: Steps, params: ParameterSet, cases: list[Step], hold_s: float) -> float:
     """Return the largest swing of the current (A peak to peak) over the last tenth of ``hold_s``."""
     worst = 0.0
     unheated = {"protection.I_cont_apk": params.values["motor.I_max_apk"]}  # the thermal budget would cut the request
     params = replace(params, values={**params.values, **unheated})
-    for k in range(count):
-        rpm, start, target = steps.draw(reachable=False)
+    for k, (rpm, start, target) in enumerate(cases):
         if k % 4 and rpm * target[1] > 0.0:
             target = target[0], -target[1]
         schedule = {
@@ -73,11 +72,11 @@ def main() -> int:
     parser.add_argument("--kind", choices=KINDS, default="saturated")
     asked = parser.parse_args()
     found: dict[tuple[str, bool], list[tuple[float, float]]] = {}
-    swing = 0.0
+    swing, points = 0.0, 0
     for k in range(asked.machines):
         source = draw(asked.kind, 1000 * asked.seed + k)
         steps = Steps(source, 1000 * asked.seed + k)
-        cases = [(reachable, steps.draw(reachable)) for reachable in (True, False) for _ in range(asked.steps)]
+        cases = [(reachable, step) for reachable in (True, False) for step in steps.draw(reachable, asked.steps)]
         designed = tune(source).parameter_set()
         for law, params in (("table", designed), ("no table", without_table(designed))):
             for reachable, case in cases:
@@ -85,7 +84,9 @@ def main() -> int:
                 found.setdefault((law, reachable), []).append((1e3 * settled, peak / steps.rated.I_max_apk))
         for predictor in (False, True) if asked.hunt else ():
             params = tune(source, TuneRequest(predictor=predictor)).parameter_set()
-            swing = max(swing, hunt(steps, params, asked.hunt, asked.hold_s) / steps.rated.I_max_apk)
+            held = steps.draw(reachable=False, count=asked.hunt)
+            points += len(held)
+            swing = max(swing, hunt(steps, params, held, asked.hold_s) / steps.rated.I_max_apk)
     for (law, reachable), rows in found.items():
         ms, peak = np.array(rows).T
         print(
@@ -94,7 +95,7 @@ def main() -> int:
             f"{len(ms)}, most {peak.max():.3f}"
         )
     if asked.hunt:
-        print(f"largest swing at rest {swing:.4f} I_max")
+        print(f"largest swing at rest {swing:.4f} I_max, {points} references held")
     slow = float(np.percentile([ms for ms, _ in found["table", True]], 95)) > REACHABLE_P95_MS
     over = max(peak for key, rows in found.items() if key[0] == "table" for _, peak in rows) > OVER
     return int(slow or over or swing > SWING)
