@@ -87,17 +87,18 @@ def tune(source: MachineFile | str | Path, request: TuneRequest | None = None) -
     rated = ratings(source, V_limit, request.overspeed_protection)
     values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}
     values |= rating_values(source, rated)
-    if request.predictor is None:
+    if (predictor := request.predictor) is None:
         turn = rated.base_speed_rpm / RPM * source.machine.pole_pairs * source.inverter.T_s
         delayed = source.inverter.delay_periods >= 1.0 and request.controller == "pi"
-        request = replace(request, predictor=delayed and turn > PREDICTED_TURN)
+        predictor = delayed and turn > PREDICTED_TURN
+        request = replace(request, predictor=predictor)
     told = (*implausible(source.machine, source.inverter), *filter(None, (rated.reaction.note,)))
     n_ucg = rated.reaction.generation_rpm
     generation = {} if math.isinf(n_ucg) else {"generation_rpm": n_ucg}
     choice = choose_current(source, request, rated.I_max_apk)
     weakening = design_field_weakening(source, rated, _weakening_mode(source, request), request.voltage_margin)
     gains = {axis: choice.gains(axis) for axis in "dq"}
-    governor = design_governor(source, rated, gains, request.governor, predictor=request.predictor, eps=request.eps)
+    governor = design_governor(source, rated, gains, request.governor, predictor=predictor, eps=request.eps)
     parts = [
         _design_current(choice),
         _design_speed(source, request, rated, choice, weakening.ramp_limit_rpm_per_s),
