@@ -300,6 +300,33 @@ def test_the_link_beside_its_ripple_and_what_sensors_show_without_current_are_kn
             assert found.offsets_apk == pytest.approx((0.1, -0.05, -0.05), abs=0.01)  # 0.002 measured
 
 
+class Coasting:
+    """A drive whose shaft brakes with a share of the design's slope of 115 rad/s2, from 577 rad/s."""
+
+    def __init__(self, share: float) -> None:
+        self.share, self.now_s = share, 0.0
+
+    def read(self, name: str) -> float:
+        return 115.0 / measured.RPM
+
+    def live(self, name: str) -> float:
+        return max(0.0, 577.0 - 115.0 * self.share * self.now_s)
+
+    def wait(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+def test_a_heavy_shaft_is_waited_for_until_it_rests_and_a_driven_one_is_not() -> None:
+    """It lost 1 % from look to look, taken for a speed that something keeps, and a move began at 577 rad/s."""
+    for share in (1.0, 0.6):
+        heavy = Coasting(share)
+        measured._come_to_rest(heavy, 1)  # type: ignore[arg-type]
+        assert heavy.live("omega_e_rad_s") < 1.0
+    driven = Coasting(0.0)
+    measured._come_to_rest(driven, 1)  # type: ignore[arg-type]
+    assert driven.now_s < 0.5
+
+
 def test_a_shaft_that_is_held_is_named(design: Design) -> None:
     with flashed(design, rotor="locked") as drive:
         _, stage = prove(drive, design)
