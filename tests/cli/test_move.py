@@ -30,6 +30,8 @@ ASKED = ("--by", "60deg", "--speed", "300rpm", "--acceleration", "300", "--settl
 J = 0.015
 MOST = 0.5
 """Following error with the new gains over that with the stored ones; measured 0.08."""
+MOST_CURRENT = 0.95
+"""Largest current of a designed move over the limit in force; measured 0.91."""
 
 
 @pytest.fixture
@@ -239,3 +241,15 @@ def test_a_standard_object_that_counts_milliamperes_is_read_as_the_map_says(tool
     code, _, said = tool(*asked, *drive, "--identify", "other.toml", "-o", "found.toml")
     assert code == 1 and "in another unit than its map states" in said, said
     assert not Path("found.toml").exists()
+
+
+@pytest.mark.chain
+@pytest.mark.usefixtures("undrawn")
+def test_a_move_of_a_design_keeps_within_the_limit_in_force(tool: Tool) -> None:
+    """A move is lent the rated current, half of I_max: the drive keeps it, and shows it in the same amperes."""
+    drive = ("--sim", "interior-2k2?drive=epos2&nv=drive.nv", "--map", "epos2")
+    assert tool("tune", "interior-2k2", "-o", "axis.toml", "--axis", "--map", "epos2")[0] == 0
+    assert tool("flash-params", "axis.toml", *drive, "--yes")[0] == 0
+    code, printed, said = tool("move", "--by", "60deg", "--design", "axis.toml", *drive, "--yes", "--json")
+    assert code == 0, said
+    assert json.loads(printed)["move"]["current_peak_a"] < MOST_CURRENT * 6.08

@@ -38,7 +38,7 @@ def test_gains_of_the_axis_reach_the_drive(tool: Tool, tmp_path: Path) -> None:
     assert code == 2 and "not of a drive of the map" in said
     # a gain in amperes is as many N m as the drive's torque per ampere says, which no snapshot holds: bytes go back
     code, _, said = tool("restore", *DRIVE, "--yes")
-    assert code == 0 and "12 of 12 objects change" in said and "-> 0x0005997C" in said, said
+    assert code == 0 and "12 of 12 objects change" in said and "-> 0x0003F5A1" in said, said
     assert tool("verify", "axis.params.toml", *DRIVE)[0] == 1
 
 

@@ -120,8 +120,8 @@ class Face:
             dictionary.show(_signal_entry(name, signal, dictionary))
         current = self.drive_map.motion.get("current")
         if current is not None and current.index in STANDARD:
-            # a standard object that counts otherwise; amperes are peak here, as everywhere behind
-            unit = current.unit.replace(UNDECIDED, " peak")
+            # a standard object that counts otherwise; amperes are rms, as those of the rated current (0x6075) and limit
+            unit = current.unit.replace(UNDECIDED, " rms")
             signal = SignalCell(current.index, current.sub, current.wire, unit, current.source)
             dictionary.show(_signal_entry("i_q_a", signal, dictionary))
         revisions = self.drive_map.identity.revisions
@@ -303,9 +303,9 @@ class _Parameters:
             return self._dictionary["cia402.encoder_counts"].number()
         if name in PID:
             return pid_of(*(self._dictionary[key].number() for key in (*SPEED, "position.K_p_per_s")))[name]
-        if name == TORQUE_PER_AMPERE:  # amperes are peak here, as everywhere behind
+        if name == TORQUE_PER_AMPERE:  # amperes are rms here, as those of the rated current
             poles, flux = (self._dictionary[f"motor.{key}"].number() for key in ("pole_pairs", "psi_f_wb"))
-            return 1.5 * poles * flux
+            return 1.5 * math.sqrt(2.0) * poles * flux
         return BY_NAME[name].default
 
     def _per_rpm(self) -> float:
