@@ -413,15 +413,40 @@ def profile_of(design: Design, shaft: Mechanics, gains: AxisGains, T: float) -> 
     source, rated = design.machine, ratings_of(design)
     top_rpm = min(rated.n_max_rpm, rated.base_speed_rpm) if rated.base_speed_rpm > 0.0 else rated.n_max_rpm
     speed = SPEED_SHARE * rad_s_from_rpm(top_rpm)
-    friction = (source.machine.tau_c_nm or 0.0) + shaft.B * speed
-    torque = TORQUE_SHARE * (rated.tau_max_nm - friction)
-    if torque <= 0.0:
-        raise DesignInfeasible(
-            f"friction takes the whole torque, {rated.tau_max_nm:.4g} N m, at {top_rpm:.4g} rpm",
-            where="machine.B_nms, machine.tau_c_nm", hint="correct the friction, or the largest speed",
-        )  # fmt: skip
+    torque = TORQUE_SHARE * _beyond_friction(rated.tau_max_nm, source, speed)
     ramp = 1.0 / shaft.antiresonance_hz if shaft.elastic else RAMP * shaft.J / gains.K_p
     return jerk_limited(speed, torque / shaft.J, math.ceil(ramp / T) * T)
+
+
+def profile_within(design: Design, torque_nm: float) -> Profile:
+    """Return the limits of a move of a design of the axis where a drive gives less than the largest torque.
+
+    The same share of what it gives beyond friction accelerates, in ramps of the same time.
+
+    Raises
+    ------
+    DesignInfeasible
+        Friction takes the whole torque.
+    """
+    source, facts = design.machine, design.facts
+    speed, acceleration, jerk = (
+        float(facts[f"axis_{name}"]) for name in ("speed_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
+    )
+    most = ratings_of(design).tau_max_nm
+    given, whole = (_beyond_friction(torque, source, speed) for torque in (min(torque_nm, most), most))
+    return Profile(speed, acceleration * given / whole, jerk * given / whole)
+
+
+def _beyond_friction(torque_nm: float, source: MachineFile, speed: float) -> float:
+    machine = source.machine
+    left = torque_nm - (machine.tau_c_nm or 0.0) - (machine.B_nms or 0.0) * speed
+    if left <= 0.0:
+        raise DesignInfeasible(
+            f"friction takes the whole torque, {torque_nm:.4g} N m, at {rpm_from_rad_s(speed):.4g} rpm",
+            where="machine.B_nms, machine.tau_c_nm",
+            hint="correct the friction, or the largest speed, or allow more current",
+        )
+    return left
 
 
 def axis_values(

@@ -51,7 +51,8 @@ TRACE = "traces/move.npz"
 )
 @click.option("--by", "way_rad", type=Quantity("angle"), required=True, metavar="ANGLE", help="Way of the shaft there "
               "and back, e.g. 90deg.")  # fmt: skip
-@click.option("--design", type=FILE, metavar="FILE", help="Take the limits of the move from this design of the axis.")
+@click.option("--design", type=FILE, metavar="FILE", help="Take the limits of the move from this design of the axis, "
+              "within the current limit.")  # fmt: skip
 @click.option("--speed", "speed_rad_s", type=SPEED, help="Speed of the move.  [default: as the drive holds it]")
 @click.option("--acceleration", type=float, metavar="RAD/S2", help="Acceleration of the move.  [default: as the drive "
               "holds it]")  # fmt: skip
@@ -98,22 +99,20 @@ def move_command(
     source = None if machine is None else load_machine_file(machine)
     times = times or (1 if source is None else IDENTIFY_TIMES)
     drive_map = map_of_drive(bus, map_file)
-    profile = _profile(design, speed_rad_s, acceleration)
     with bus.connect() as connection:
         drive = PositionDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
         check_motion(drive.node.map, drive.identity)
+        i_max = motion.i_max_apk or drive.current_allowed_apk
+        profile = _profile(design, i_max, speed_rad_s, acceleration)
         lent, find = _lent(drive, profile)
         speed = profile.get(_SPEED) or _held(drive, _SPEED)
         speed_max = motion.speed_max_rad_s or (SPEED_MARGIN * rad_s_from_rpm(speed) if speed else None)
         if speed_max is None:
-            raise ConfigError(
-                "the speed of the drive's own move is not known: its map has no row for it",
-                hint="give --speed-max",
-            )  # fmt: skip
+            unknown = "the speed of the drive's own move is not known: its map has no row for it"
+            raise ConfigError(unknown, hint="give --speed-max")
         envelope = Envelope(
-            i_max_apk=motion.i_max_apk or drive.current_allowed_apk, speed_max_rad_s=speed_max,
-            duration_s=DURATION_S * times, travel_rad=TRAVEL_MARGIN * abs(way_rad),
-            shaft=motion.shaft or "free", load=motion.load, brake=motion.brake,
+            i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S * times, load=motion.load,
+            travel_rad=TRAVEL_MARGIN * abs(way_rad), shaft=motion.shaft or "free", brake=motion.brake,
         )  # fmt: skip
         envelope.refuse_gravity()
         gains = drive.held_gains()
@@ -211,19 +210,23 @@ def _unit(name: str) -> str:
     return BY_NAME[name].unit
 
 
-def _profile(design: Path | None, speed_rad_s: float | None, acceleration: float | None) -> dict[str, float]:
-    """Return the limits that are asked for, by catalogue name."""
+def _profile(
+    path: Path | None, i_max_apk: float, speed_rad_s: float | None, acceleration: float | None
+) -> dict[str, float]:
+    """Return the limits that are asked for, by catalogue name; those of a design within the current of the move."""
+    from pmsmtool.axis.design import profile_within
     from pmsmtool.design.design_file import load_design
+    from pmsmtool.drive.envelope import largest_torque
     from pmsmtool.errors import ConfigError
     from pmsmtool.units import rpm_from_rad_s
 
-    asked: dict[str, float | None] = {"speed": speed_rad_s, "acceleration": acceleration, "jerk": None}
-    if design is not None:
-        facts = load_design(design).facts
-        if "axis_speed_rad_s" not in facts:
-            raise ConfigError("not a design of an axis", where=str(design), hint="`pmsmtool tune --axis` makes one")
-        keys = {"speed": "axis_speed_rad_s", "acceleration": "axis_acceleration_rad_s2", "jerk": "axis_jerk_rad_s3"}
-        asked = {name: value or float(facts[keys[name]]) for name, value in asked.items()}
+    asked = {"speed": speed_rad_s, "acceleration": acceleration, "jerk": None}
+    if path is not None:
+        design = load_design(path)
+        if "axis_speed_rad_s" not in design.facts:
+            raise ConfigError("not a design of an axis", where=str(path), hint="`pmsmtool tune --axis` makes one")
+        within = profile_within(design, largest_torque(design.machine.machine, i_max_apk))
+        asked = {name: value or getattr(within, name) for name, value in asked.items()}
     rows = {"speed": (_SPEED,), "acceleration": (_UP, _DOWN), "jerk": (_JERK,)}
     return {
         row: rpm_from_rad_s(value) for name, value in asked.items() if value is not None for row in rows[name]

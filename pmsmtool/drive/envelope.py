@@ -120,8 +120,12 @@ def largest_acceleration(machine: MachineParameters, i_max_apk: float) -> float 
     """
     if not machine.J_kgm2:
         return None
-    torque = max(machine.torque_nm(-i_max_apk * math.sin(angle), i_max_apk * math.cos(angle)) for angle in _ANGLES)
-    return torque / (LEAST_INERTIA * machine.J_kgm2)
+    return largest_torque(machine, i_max_apk) / (LEAST_INERTIA * machine.J_kgm2)
+
+
+def largest_torque(machine: MachineParameters, i_max_apk: float) -> float:
+    """Return the largest torque (N m) of a current (A peak)."""
+    return max(machine.torque_nm(-i_max_apk * math.sin(angle), i_max_apk * math.cos(angle)) for angle in _ANGLES)
 
 
 def voltage_speed(known: MachineFile, i_max_apk: float) -> float:

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pmsmtool.axis.design import PID, AxisGains, AxisRequest, axis_path, from_pid, with_axis
+from pmsmtool.axis.design import PID, AxisGains, AxisRequest, axis_path, from_pid, profile_within, with_axis
 from pmsmtool.axis.loops import lifted
 from pmsmtool.axis.robustness import axis_margins
 from pmsmtool.axis.search import Box, Limits, stiffest
@@ -19,6 +19,7 @@ from pmsmtool.design.design_file import Design, design_text, parse_design
 from pmsmtool.design.loops.speed_loop import Notch
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive.envelope import largest_torque
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.flash.journal import Entry
@@ -175,6 +176,21 @@ def test_gains_that_follow_better_are_kept() -> None:
         ]
     told = [note for note in design_axis(source, TuneRequest(), ASKED, own, edge).notes if "not kept" in note]
     assert told, "followed better, with margins that may not be asked for"
+
+
+def test_a_move_keeps_within_what_a_smaller_current_gives() -> None:
+    """Rated current is half of I_max here: a move of 0.6 of the torque at I_max would be beyond it."""
+    made, motor = designed("pmsmsim", 0.0, 0.0), machine().machine
+    largest, rated = largest_torque(motor, motor.I_max_apk or 0.0), largest_torque(motor, motor.I_nom_apk or 0.0)
+    whole, within = profile_within(made, largest), profile_within(made, rated)
+    friction = (motor.tau_c_nm or 0.0) + (motor.B_nms or 0.0) * whole.speed
+    assert whole.acceleration == pytest.approx(made.facts["axis_acceleration_rad_s2"], rel=1e-9)
+    assert profile_within(made, 2.0 * largest) == whole, "no more than its own"
+    torque = within.acceleration * (motor.J_kgm2 or 0.0)
+    assert torque == pytest.approx(0.6 * (rated - friction), rel=1e-3)  # measured 1e-4: angles of the vector, 5 deg
+    assert within.acceleration / within.jerk == pytest.approx(whole.acceleration / whole.jerk), "ramps of the same time"
+    with pytest.raises(DesignInfeasible, match="friction takes"):
+        profile_within(made, friction)
 
 
 def test_a_gain_per_increment_follows_the_increments_that_the_drive_holds() -> None:
