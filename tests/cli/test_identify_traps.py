@@ -90,8 +90,8 @@ TRAPS: dict[str, tuple[str, Spoil, str]] = {
     ),
     "rotor leaves the turning vector": (
         "rotation_forward",
-        lambda t: {"theta_M_rad": t["theta_M_rad"] + 0.6 * np.sin(6.0 * t["theta_imposed_rad"])},
-        "E_POLE_PAIRS",
+        lambda t: {"theta_M_rad": t["theta_M_rad"] + 1.0 * np.sin(6.0 * t["theta_imposed_rad"])},
+        "E_ROTOR_MOVED",
     ),
     "encoder offset far off": ("speeds", turned, "E_NOT_IDENTIFIABLE"),
     "rotor moves in the injection": ("square_q_6", lambda t: ramp(t, "theta_M_rad", 0.1), "E_ROTOR_MOVED"),
