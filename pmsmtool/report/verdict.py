@@ -125,7 +125,7 @@ def verdict_of(record: Mapping[str, Any], complete: Sequence[str] = COMPLETE) ->
     left = [*unmeasured, *_unchecked(latest, complete)]
     missing = [*_missing(latest, complete), *_unfinished(account, latest)]
     head = _counted(ran, latest, complete)
-    partial = bool(missing or left) or any(stage["status"] == "partial" for stage in latest)
+    partial = bool(missing or left or not ran) or any(stage["status"] == "partial" for stage in latest)
     if not partial:
         return Verdict("pass", "PASS", (head, *_shown(latest, complete), *accepted), simulated)
     return Verdict("partial", "PARTIAL", ("; ".join((*_wrong(latest), head, *left)), *accepted, *missing), simulated)

@@ -122,6 +122,10 @@ def test_an_accepted_limit_is_shown_on_the_first_screen() -> None:
     assert found.kind == "pass" and line in found.details
 
 
+def test_a_run_in_which_nothing_ran_is_no_pass() -> None:
+    assert verdict_of({"stages": []}, ("identify",)).headline.startswith("PARTIAL")
+
+
 def test_a_run_that_was_killed_in_a_repeated_stage_does_not_keep_its_pass() -> None:
     found = verdict_of(record(account={"state": "open", "stage": "prove", "exit_code": None}))
     assert found.kind == "partial" and "prove: begun, and its end was not recorded" in found.details
