@@ -115,7 +115,8 @@ class SdoChannel:
         self._request_id = 0x600 + node
         self._sends = connection.sends[self._request_id]
         self._mailbox = connection.mailbox(0x580 + node)
-        self._lock = threading.Lock()
+        # Of the thread: one that is interrupted while a transfer begins must still be able to restore the drive.
+        self._lock = threading.RLock()
 
     # ---- for callers ---------------------------------------------------------------------------
 

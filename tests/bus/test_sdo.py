@@ -386,3 +386,19 @@ def test_expedited_writes_under_loss(share: float) -> None:
             assert slave.objects[0x3000, k % 7] == value
             assert channel.read(0x3000, k % 7) == value
     assert channel.retries > 0
+
+
+def test_an_interrupt_as_a_transfer_begins_leaves_the_channel_to_its_thread(channel: SdoChannel) -> None:
+    """Its traceback holds the begun transfer while the drive is restored: one jog in 50 hung for ever at Ctrl-C."""
+    read: list[bytes] = []
+
+    def interrupted() -> None:
+        begun = channel._transfer(*A, Mode.SEGMENTED, None)
+        begun.__enter__()
+        read.append(channel.read(*A))
+        begun.__exit__(None, None, None)
+
+    thread = threading.Thread(target=interrupted, daemon=True)
+    thread.start()
+    thread.join(5.0)
+    assert read == [b"\x01\x02\x03\x04"]
