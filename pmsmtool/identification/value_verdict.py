@@ -12,6 +12,7 @@ from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS
 from pmsmtool.estimators.cross_check import CrossCheck
 from pmsmtool.estimators.estimate import Verdict, coverage_factor, statistical_half_width, total_half_width
 from pmsmtool.estimators.resistance import at_the_test
+from pmsmtool.estimators.shaft.mechanics import ENCODER_FALLBACK
 from pmsmtool.identification import flux_map, frequency_response
 from pmsmtool.identification.evaluate import NOTABLY_WIDER, Evaluation
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
@@ -165,7 +166,7 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     if evaluation.mechanics is not None:
         if evaluation.mechanics.drag is not None:
             conditions["drag_nms2"] = evaluation.mechanics.drag.value
-        if evaluation.mechanics.unexplained and not evaluation.mechanics.J.fallback:
+        if evaluation.mechanics.unexplained and evaluation.mechanics.J.fallback in ("", ENCODER_FALLBACK):
             conditions[TORQUE_NOISE] = evaluation.mechanics.ripple
         errors_rad |= {h.order: h.amplitude for h in evaluation.mechanics.harmonics.encoder_rad}
     often = dict(zip(ENCODER_ORDERS, ("once", "twice"), strict=True))

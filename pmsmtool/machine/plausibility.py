@@ -17,8 +17,8 @@ def implausible(machine: MachineParameters, inverter: InverterParameters) -> lis
     """Return a sentence for each value that is likely in a wrong unit."""
     found: list[str] = []
     tau_e = min(machine.L_d_h, machine.L_q_h) / machine.R_s_ohm
-    if not 1e-4 <= tau_e <= 1.0:
-        found.append(f"L/R = {format_quantity(tau_e, 's')} is unusual for a machine (0.1 ms to 1 s): check the units")
+    if not 5e-5 <= tau_e <= 1.0:
+        found.append(f"L/R = {format_quantity(tau_e, 's')} is unusual for a machine (50 us to 1 s): check the units")
     if machine.n_nom_rpm is not None:
         emf = machine.psi_f_wb * machine.pole_pairs * machine.n_nom_rpm * RAD_S_PER_RPM
         if emf > inverter.V_max_v:

@@ -88,6 +88,7 @@ SCALE_FLOOR = 3e-4
 ENCODER_LEAST_RAD = 2e-3
 """Error of the encoder from which on the fit is made again without it: at 1 degree with 6 pole pairs the first one has
 B 980 % off at +-46 %, the second 0.3 at +-2.5 %."""
+ENCODER_FALLBACK = "the encoder is off centre, which the fit takes out to the first order only"
 NO_HARMONICS = AngleHarmonics()
 MEAN_STD = 0.04
 """Relative standard deviation of the inertia by mean accelerations: six shafts with play were 0.1 to 1.6 % off."""
@@ -222,12 +223,14 @@ def estimate_mechanics(
 
     found = _explained(partial(fitted, harmonics), runs)
     sizes = found[1].x[SHAFT + 1 : -2 * len(runs)]
+    note = ""
     if max(h.amplitude for h in encoder_errors(sizes, ())) > ENCODER_LEAST_RAD:  # more than the shapes of a first order
+        note = ENCODER_FALLBACK
         again = replace(harmonics, encoder_rad=encoder_errors(sizes, harmonics.encoder_rad))
         with contextlib.suppress(IdentificationError):
             centred = _explained(partial(fitted, again), runs)
             if max(_noise(centred[3]).values()) <= max(_noise(found[3]).values()):
-                found, harmonics = centred, again
+                found, harmonics, note = centred, again, ""
     blocks, with_drag, chi2, noisy = found
     noise = _noise(noisy)
     unexplained = _unexplained(blocks, noisy)
@@ -262,7 +265,7 @@ def estimate_mechanics(
     scale_std = math.hypot(scale_std, SCALE_FLOOR)
     estimates = [
         Estimate(value, math.hypot(std, scale_std * value), tolerance.inertia * abs(value), unit, n=n, chi2=chi2,
-                 method=METHOD)
+                 method=METHOD, fallback=note)
         for value, std, unit in zip((J, B, tau_c), stds, MEANS.values(), strict=True)
     ]  # fmt: skip
     ripple = max(noise.values())
