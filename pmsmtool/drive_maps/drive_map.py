@@ -24,7 +24,7 @@ from pmsmtool.drive_maps.vendor_tuning import VendorTuning
 from pmsmtool.drive_maps.wire_units import as_peak
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.params.catalogue import CATALOGUE, INCREMENTS, OWN_SCALES, TORQUE_PER_AMPERE
+from pmsmtool.params.catalogue import CATALOGUE, INCREMENTS, OWN_SCALES, TORQUE_PER_AMPERE, layout_signature
 from pmsmtool.params.parameter_set import SATURATION, TABLE_NAMES, ParameterSet
 from pmsmtool.plain_text import counted
 
@@ -293,6 +293,11 @@ class DriveMap:
     sources: Mapping[str, str] = field(default_factory=dict)
     vendor_tuning: VendorTuning | None = None
     identity: IdentityRows = field(default_factory=IdentityRows)
+
+    @property
+    def signature(self) -> int:
+        """Layout signature of the family's parameter set, 0 where it has none."""
+        return layout_signature() if self.staging else 0
 
     def is_for(self, vendor: int, product: int) -> bool:
         """Whether a drive of this identity belongs to the family."""

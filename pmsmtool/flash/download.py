@@ -36,7 +36,6 @@ from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot, State
 from pmsmtool.flash.map_gate import check_map, remember_map
 from pmsmtool.flash.plan import Change, Plan, differences
 from pmsmtool.flash.whole_drive import WholeDrive, parameters_of
-from pmsmtool.params.catalogue import layout_signature
 from pmsmtool.plain_text import counted
 
 CONSUMERS_MAX = 8
@@ -296,9 +295,8 @@ class Download:
             if name in self._old_marks
         ]
         snapshot = Snapshot(
-            "journal", "open", self.identity, layout_signature() if self.node.map.staging else 0,
-            self.plan.content, tuple(entries),
-        )  # fmt: skip
+            "journal", "open", self.identity, self.node.map.signature, self.plan.content, tuple(entries)
+        )
         remember_map(self.node.map, self.folder)
         journal = self.folder.begin(snapshot)
         self._say(f"journal: {self.folder.path}")

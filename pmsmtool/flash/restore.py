@@ -19,7 +19,7 @@ from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
 from pmsmtool.flash.map_gate import contradictions
 from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
 from pmsmtool.flash.whole_drive import parameters_of
-from pmsmtool.params.catalogue import BY_NAME, layout_signature
+from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import ParameterSet, table_unit
 from pmsmtool.plain_text import counted
 
@@ -100,10 +100,8 @@ def take_backup(node: DriveNode, identity: Identity, *, progress: Progress = lam
             entries.append(Entry(name, index, sub, node.sdo.upload(index, sub, mode=Mode.SEGMENTED).data))
         except SdoAbort:
             continue  # the drive does not keep this mark
-    signature = layout_signature() if node.map.staging else 0
-    return Snapshot(
-        "backup", "done", identity, signature, snapshot_set(node.map, entries).content_hash(), tuple(entries)
-    )
+    content = snapshot_set(node.map, entries).content_hash()
+    return Snapshot("backup", "done", identity, node.map.signature, content, tuple(entries))
 
 
 def snapshot_set(
@@ -150,9 +148,9 @@ def check_snapshot(drive_map: DriveMap, snapshot: Snapshot, identity: Identity, 
             f"the snapshot is of the drive with serial number {theirs.serial}, this one is {identity.serial}",
             hint="--other-drive when it shall go into this drive (a spare part)",
         )
-    if drive_map.staging and snapshot.signature != layout_signature():
+    if drive_map.staging and snapshot.signature != drive_map.signature:
         raise ConfigError(
-            f"the snapshot's layout {snapshot.signature:#010x} is not this program's {layout_signature():#010x}",
+            f"the snapshot's layout {snapshot.signature:#010x} is not this program's {drive_map.signature:#010x}",
             likely="it was taken by another version of pmsmtool",
             hint="restore it with that version",
         )

@@ -112,6 +112,10 @@ def backup(tmp_path_factory) -> Snapshot:
     return replace(found, identity=replace(found.identity, serial=22001))  # of the profile interior-2k2
 
 
+def test_only_the_reference_set_has_a_layout(backup: Snapshot) -> None:
+    assert backup.signature == layout_signature() and load_family("epos4").signature == 0
+
+
 def of_identity(**change):
     return lambda snapshot: replace(snapshot, identity=replace(snapshot.identity, **change))
 
