@@ -366,9 +366,9 @@ def overspeed_option(function: Function) -> Function:
     """Add ``--overspeed-protection``: what holds the DC link at a fault above uncontrolled generation."""
     return click.option(
         "--overspeed-protection",
-        type=click.Choice(["chopper", "short-circuit"]),
-        help="What holds the DC link at a fault above the speed of uncontrolled generation: a brake chopper that you "
-        "state, or shorted windings.  [default: short-circuit where the magnet stands it]",
+        type=click.Choice(["chopper", "battery", "short-circuit"]),
+        help="What holds the DC link at a fault above the speed of uncontrolled generation: a brake chopper or a "
+        "battery that you state, or shorted windings.  [default: short-circuit where the magnet stands it]",
     )(function)
 
 

@@ -66,8 +66,8 @@ class TuneRequest:
         the accelerated optimisation for a constant one; for a polar law the table where it knows more than the law
         (``polar_values.weakening_mode``).
     overspeed_protection : str or None
-        What holds the DC link at a fault above the speed of uncontrolled generation: ``chopper`` (a person states it)
-        or ``short-circuit``; None: a short circuit where the magnet stands it, else nothing, and the design says so.
+        What holds the DC link at a fault above the speed of uncontrolled generation: ``chopper`` or ``battery`` (a
+        person states it), or ``short-circuit``; None: shorted where the magnet stands it, else nothing, which is said.
     """
 
     controller: str = "pi"

@@ -3,9 +3,10 @@
 
 With the gates off the diodes rectify the back-EMF: above the speed at which its line-to-line amplitude reaches the
 link's limit the rotor drives the voltage there (Jahns and Caliskan, IEEE Trans. Ind. Appl. 35 (1999) 1347-1357).
-A brake chopper that takes the rectified current, psi_f/L_d at most, holds it. Shorted windings keep the link out of it;
-their flux linkage stands still in the stator frame while the rotor turns, so i_d passes -(psi_f + |psi|)/L_d, |psi|
-being the linkage at the instant of the short circuit; R takes some of that away. With neither, no speed beyond it.
+A brake chopper or a battery that takes the rectified current, psi_f/L_d at most, holds it. Shorted windings keep the
+link out of it; their flux linkage stands still in the stator frame while the rotor turns, so i_d passes
+-(psi_f + |psi|)/L_d, |psi| being the linkage at the instant of the short circuit; R takes some of that away. With
+neither, no speed beyond it.
 """
 
 from __future__ import annotations
@@ -22,11 +23,17 @@ from pmsmtool.units import rpm_from_rad_s
 COLD_C = 0.0
 """Temperature (degC) of the strongest magnet that is reckoned with: started up in an unheated hall."""
 
-Protection = Literal["chopper", "short-circuit"]
-"""What keeps the link below its limit at a fault: a brake chopper that a person states, or shorted windings."""
+Protection = Literal["chopper", "battery", "short-circuit"]
+"""What keeps the link below its limit at a fault: a brake chopper or a battery that a person states, or shorted
+windings."""
+STATED: dict[Protection | None, str] = {"chopper": "brake chopper", "battery": "battery"}
+"""Those that the tool takes a person's word for."""
 SPEED_ROOM = 1.05
 """Over-speed trip over the largest speed, at least: what a speed loop overshoots."""
-HINT = "fit a brake chopper and state it (--overspeed-protection chopper, or U_dc_chopper_v), or lower n_max_rpm"
+HINT = (
+    "state what takes the energy: --overspeed-protection chopper (or U_dc_chopper_v), or battery where one feeds the "
+    "link; or lower n_max_rpm"
+)
 
 
 def generation_rpm(machine: MachineParameters, U_dc_max_v: float) -> float:
@@ -103,14 +110,20 @@ def fault_reaction(
     if n_trip_rpm <= from_rpm:
         return FaultReaction(from_rpm, 0.0, any_rpm, "gates off: the back-EMF stays below U_dc_max at n_trip", "")
     psi = _cold(machine)
-    if protection == "chopper":
-        rectified, note = -psi / machine.L_d_decoupling_h, ""
-        if rectified < i_d_min_a:
-            note = (
-                f"a fault above {from_rpm:.4g} rpm rectifies through the brake chopper: i_d can reach {rectified:.4g} "
-                f"A, beyond the {i_d_min_a:.4g} A allowed (magnet)"
+    if protection in STATED:
+        rectified, notes = -psi / machine.L_d_decoupling_h, []
+        if protection == "battery":
+            notes.append(
+                f"a fault above {from_rpm:.4g} rpm feeds up to {-rectified:.4g} Apk of rectified current into the "
+                "battery: its protection must not open there, also when it is full"
             )
-        return FaultReaction(from_rpm, 0.0, any_rpm, "gates off: a brake chopper holds the DC link, as stated", note)
+        if rectified < i_d_min_a:
+            notes.append(
+                f"a fault above {from_rpm:.4g} rpm rectifies through the {STATED[protection]}: i_d can reach "
+                f"{rectified:.4g} A, beyond the {i_d_min_a:.4g} A allowed (magnet)"
+            )
+        how = f"gates off: a {STATED[protection]} holds the DC link, as stated"
+        return FaultReaction(from_rpm, 0.0, any_rpm, how, "; ".join(notes))
     # from where the back-EMF reaches the nominal link: the linkage at the voltage limit is that of the magnet there
     peak = -2.0 * psi / machine.L_d_decoupling_h
     if peak >= i_d_min_a:

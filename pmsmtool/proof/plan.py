@@ -26,6 +26,7 @@ from pmsmtool.machine.two_masses import (
     UNSEEN,
     hides_play,
 )
+from pmsmtool.machine.uncontrolled_generation import STATED
 from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES
 from pmsmtool.units import RAD_S_PER_RPM
 
@@ -332,10 +333,9 @@ class _Sizes:
 
 
 def _generation_rpm(design: Design) -> float:
-    """Speed (rpm) above which a fault charges the DC link; infinity where shorted windings or a chopper prevent it."""
-    stated = design.machine.inverter.U_dc_chopper_v is not None
-    chopper = stated or design.request.get("overspeed_protection") == "chopper"
-    protected = chopper or design["protection.n_short_circuit_rpm"] > 0.0
+    """Speed (rpm) above which a fault charges the DC link; infinity where something holds it."""
+    held = design.machine.inverter.U_dc_chopper_v is not None or design.request.get("overspeed_protection") in STATED
+    protected = held or design["protection.n_short_circuit_rpm"] > 0.0
     return math.inf if protected else float(design.facts.get("generation_rpm", math.inf))
 
 

@@ -57,6 +57,9 @@ def test_a_magnet_that_does_not_stand_it_keeps_the_gates_off_and_says_so() -> No
     assert stated.short_from_rpm == 0.0 and "chopper" in stated.how and math.isinf(stated.trip_most_rpm)
     assert f"i_d can reach {-PSI_COLD / 2.3e-3:.4g} A, beyond the -56 A allowed" in stated.note
     assert fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -1e3, "chopper").short_from_rpm == 0.0
+    fed = fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -1e3, "battery")
+    assert fed.short_from_rpm == 0.0 and "battery" in fed.how and math.isinf(fed.trip_most_rpm)
+    assert f"up to {PSI_COLD / 2.3e-3:.4g} Apk of rectified current into the battery" in fed.note
     with pytest.raises(DesignInfeasible, match="i_d to .* beyond the -56 A allowed"):
         fault_reaction(MACHINE, U_NOM, U_MAX, 1.01 * n, -56.0, "short-circuit")
     quiet = fault_reaction(MACHINE, U_NOM, U_MAX, 0.99 * n, -56.0)
