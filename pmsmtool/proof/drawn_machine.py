@@ -226,8 +226,8 @@ def _timing(machine: MachineFile, rng: np.random.Generator, *, late: bool) -> tu
     apart = (2.0 * where - 1.0) * TIMING_COVERAGE * math.hypot(*stds)
     shift = max(-T_s, min(T_s, instant - apart))
     lag_s, shift_s = max(0.0, lag + apart), shift if late else min(0.0, shift)
-    if instant > 0.0 and rng.random() < 0.5:
-        return lag_s, 0.0, max(0.0, shift_s, age - lag_s)
+    if max(instant, age) > 0.0 and rng.random() < 0.5:
+        return lag_s, 0.0, max(0.0, shift_s, age)
     return lag_s, shift_s, 0.0
 
 

@@ -413,8 +413,8 @@ def test_what_depends_on_the_current_acts_at_one_edge_of_each_leg(plain: Shots) 
     assert with_slope.std > EDGE_STD * slope * d.T_s[k]
 
 
-def test_square_waves_that_contradict_the_turning_machine_widen_the_interval(plain: Shots) -> None:
-    """As iron loss does, which looks like a sample that is early by a third of a period."""
+def test_square_waves_that_contradict_the_turning_machine_stand_alone(plain: Shots) -> None:
+    """As an old angle does, which looks like a late sample. Before, with 0.8 T_s at 0.2: L_d 15 % off at +-36 %."""
     d, k = plain.drives, 0
     table = np.tile(np.linspace(-0.06, 0.24, len(INSTANTS))[:, None] * d.T_s[k], (1, len(LAGS)))
     fits = plain.estimate(k)
@@ -430,10 +430,12 @@ def test_square_waves_that_contradict_the_turning_machine_widen_the_interval(pla
     agrees = estimate(shown(1.0 - fits.delay))
     assert agrees.sampling is not None
     assert agrees.L_d.value == pytest.approx(fits.L_d.value, rel=1e-3)  # measured 2.4e-4
-    apart = estimate(shown(-0.3))
+    apart = estimate(shown(0.8))
     assert agrees.apart_s == 0.0 and apart.apart_s > 0.1 * d.T_s[k]
-    for ours, true in ((apart.L_d, d.L_d[k]), (apart.L_q, d.L_q[k])):
-        assert abs(ours.value - true) < 2.0 * ours.std
+    assert apart.sampling is not None and abs(apart.sampling.instant_s) < 0.02 * d.T_s[k]
+    alone = plain.estimate(k, compensate=False)
+    for ours, theirs in ((apart.L_d, alone.L_d), (apart.L_q, alone.L_q)):
+        assert (ours.value, ours.std) == pytest.approx((theirs.value, theirs.std), rel=1e-3)
 
 
 def _shaken(plain: Shots, wave: Callable[[np.ndarray], np.ndarray]) -> tuple[InductanceResult, InductanceResult]:

@@ -328,11 +328,12 @@ def test_the_prediction_samples_when_the_identified_sensors_do() -> None:
             assert np.median(lags) < 0.2 * lags.max(), "a short lag is as usual as a long one"
 
 
-def test_an_angle_may_be_as_old_as_the_voltage_at_speed_shows() -> None:
-    """Square waves at standstill see no angle: of 45 us the instant that fits them and the speeds was 15."""
+@pytest.mark.parametrize("instant_s", [15e-6, -1e-7])
+def test_an_angle_may_be_as_old_as_the_voltage_at_speed_shows(instant_s: float) -> None:
+    """Square waves at standstill see no angle: of 45 us the instant that fits them and the speeds was 15, or none."""
     source, std = light(), 0.4e-6
-    inverter = replace(source.inverter, current_lag_s=0.0, sampling_instant_s=15e-6)
-    estimates = {name: Estimate(value, std, 0.0, "s") for name, value in ((LAG, 0.0), (INSTANT, 15e-6))}
+    inverter = replace(source.inverter, current_lag_s=0.0, sampling_instant_s=instant_s)
+    estimates = {name: Estimate(value, std, 0.0, "s") for name, value in ((LAG, 0.0), (INSTANT, instant_s))}
     known = {**source.conditions, "shown_instant_s": 45e-6}
     made = tune(replace(source, inverter=inverter, estimates=estimates, conditions=known), TuneRequest())
     limits = conditions(made, U_dc_v=24.0)

@@ -210,6 +210,8 @@ def estimate_inductances(
             # iron loss turns the voltage of a turning machine, as an instant would; what cannot follow says nothing
             misfit = {a: m * (fits[a].chi2 <= CHI2_REFUSE and instant.knows(fits[a].delay)) for a, m in misfit.items()}
             fits, instant = alone, None
+        elif max((fits[a].chi2 - fit.chi2) * fit.n for a, fit in alone.items()) > INSTANT_LIMIT**2:
+            fits, misfit, instant = alone, dict.fromkeys(alone, 0.0), replace(instant, value_s=0.0)  # an old angle
     widen = {axis: _widening(fit, shots[axis], noise.sigma_a, f"inductance, {axis} axis") for axis, fit in fits.items()}
     misfit = {axis: math.hypot(misfit[axis], widen[axis][2] * fit.L_h) for axis, fit in fits.items()}
     angle, angle_std = _axis_angle(fits, cross)
