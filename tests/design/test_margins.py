@@ -77,6 +77,19 @@ def test_an_unstable_loop_has_no_positive_margin() -> None:
     assert found.delay_s[0] == 0.0
 
 
+@pytest.mark.parametrize(("sign", "least"), [(1.0, 60.0), (-1.0, -math.inf)])
+def test_a_resonance_far_from_minus_one_takes_no_margin(sign: float, least: float) -> None:
+    """|L| passes 1 again around the positive real axis, or around -1. A healthy elastic shaft had -174, not 43 deg."""
+    place = 400.0
+
+    def loop(omega: np.ndarray) -> np.ndarray:
+        s = 1j * np.atleast_2d(omega)
+        return 100.0 / s + sign * 0.8 * place * s / (s**2 + 0.2 * place * s + place**2)
+
+    found = vector_margins(loop, 1e-4, 100.0)
+    assert least < found.phase_deg[0] and (found.phase_deg[0] > 0.0) == (sign > 0.0)
+
+
 def test_speed_margins_of_other_machines_are_those_of_their_own_loop() -> None:
     design = design_of()
     source = design.machine

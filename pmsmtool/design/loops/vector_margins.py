@@ -43,18 +43,20 @@ class VectorMargins:
 def vector_margins(loop: Response, T_s: float, crossover: float) -> VectorMargins:
     """Return the margins of loops that are stable when cut; ``crossover`` (rad/s) is about where they cross.
 
-    The phase margin is the least over all gain crossings; the gain margin is that at the lowest phase crossing above
-    the first gain crossing or, when the loop already encircles -1, below 0 dB.
+    The phase margin is that of the gain crossing nearest to -1: of a resonance, L may turn back on the positive side.
+    The gain margin is that at the lowest phase crossing above the first gain crossing or, when the loop already
+    encircles -1, below 0 dB; both are negative then.
     """
     nyquist = math.pi / T_s
     grid = np.geomspace(min(GRID_START * crossover, 0.1 * nyquist), nyquist, GRID_POINTS)
     values = loop(grid)
     size = np.log(np.abs(values))
     phase, omega = _phase_margins(loop, grid, size)
-    worst = np.nanargmin(np.where(np.isnan(phase), np.inf, phase), axis=1)
+    worst = np.argmin(np.where(np.isnan(phase), np.inf, np.abs(phase)), axis=1)
     rows = np.arange(len(values))
     least, at = phase[rows, worst], omega[rows, worst]
     gain = _gain_margins(loop, grid, values)
+    least = np.where(gain < 0.0, -np.abs(least), least)
     with np.errstate(invalid="ignore"):
         delay = np.where(least > 0.0, least / at, 0.0)
     return VectorMargins(np.degrees(np.where(np.isnan(least), np.inf, least)), gain, delay)
