@@ -39,9 +39,11 @@ from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
 from pmsmtool.drive_maps.shipped_maps import family_of, load_family
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.flash.gain_journal import any_left, restore_left
+from pmsmtool.identification.learned_gains import Learned
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.measurement.learn_gains import GAIN, INTEGRAL, gain_object, learn_speed_loop, within_budget
+from pmsmtool.measurement.learn_position_gain import learn_position_gain, position_gain
 from pmsmtool.measurement.learned_rows import learned_gains, shown_currents
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.simulated_machine import settings_of
@@ -201,6 +203,10 @@ def _learn(
     for note in measured.notes:
         result.why["note"] = note
     _judge(result, told, machine, gains, measured, drive)
+    held = position_gain(drive.node)
+    if held is not None and gains.position == (held.item.index, held.item.sub):
+        _note(result, "K_v", learn_position_gain(connection, drive.node, held, envelope, lambda text: None), "value",
+              gains.K_v_per_s)  # fmt: skip
 
 
 def _judge(
@@ -214,20 +220,23 @@ def _judge(
         INTEGRAL: (FORMS[gains.form], gains.integral_scale * (1.0 if relative else stronger)),
     }
     for name, (form, scale) in truth.items():
-        one = found[name]
-        key = name.split(".")[1][:3]
-        result.why[key] = one.why
-        if one.scale is None:
-            result.verdicts[key] = "unknown"
-            continue
-        result.errors[key] = one.scale / scale - 1.0
-        result.verdicts[key] = "right" if one.form == form and abs(result.errors[key]) <= RIGHT else "wrong"
+        _note(result, name.split(".")[1][:3], found[name], form, scale)
     kind = shown_currents(told, measured, drive).kind
     rms = gains.rms if drive.current_undecided or result.family == "cia402" else None
     if kind is None or rms is None:
         result.verdicts["current"] = "unknown" if rms is not None else "published"
     else:
         result.verdicts["current"] = "right" if kind == ("rms" if rms else "peak") else "wrong"
+
+
+def _note(result: Result, key: str, one: Learned, form: str, scale: float) -> None:
+    """Keep what was found of a gain beside its truth."""
+    result.why[key] = one.why
+    if one.scale is None:
+        result.verdicts[key] = "unknown"
+        return
+    result.errors[key] = one.scale / scale - 1.0
+    result.verdicts[key] = "right" if one.form == form and abs(result.errors[key]) <= RIGHT else "wrong"
 
 
 def main() -> int:
@@ -256,9 +265,9 @@ def main() -> int:
     counted = Counter((key, verdict) for r in results for key, verdict in r.verdicts.items())
     wrong = sum(n for (_, verdict), n in counted.items() if verdict == "wrong")
     print(f"{len(results)} drives of {len(FAMILIES)} families")
-    for key in ("K_p", "K_i", "current"):
+    for key in ("K_p", "K_i", "K_v", "current"):
         right, bad = counted[key, "right"], counted[key, "wrong"]
-        known = max(1, len(results) - counted[key, "published"])
+        known = max(1, right + bad + counted[key, "unknown"])
         sizes = sorted(100 * abs(r.errors[key]) for r in results if key in r.errors)
         spread = f"; error median {sizes[len(sizes) // 2]:.1f} %, largest {sizes[-1]:.1f} %" if sizes else ""
         print(f"{key}: decided {right + bad} of {known} ({100 * (right + bad) / known:.0f} %), wrong {bad}{spread}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,13 +18,11 @@ from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
     from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
+    from pmsmtool.identification.learned_gains import Learned
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.measurement.learn_gains import GainObject, LearnedLoop
 
 OBJECT = re.compile(r"0x([0-9A-Fa-f]{4})(?::0?x?([0-9A-Fa-f]{1,2}))?")
-SPEED_SHARE = 0.4
-"""Speed limit without --speed-max, of the largest speed of the machine: no field weakening."""
-DURATION_S = 120.0
 NORMAL = 1.96
 
 
@@ -56,18 +54,18 @@ def learn_command(
     output: Path | None,
     map_file: Path | None,
 ) -> None:
-    """Find out what one count of a gain of the speed loop is worth on this drive, by its response.
+    """Find out what one count of a gain of the speed or position loop is worth on this drive, by its response.
 
     The gains are changed by known ratios while the voltage is off, the speed is stepped, and the answers say scale and
-    form of both gains, and whether shown currents are peak or rms. What the data do not decide stays unknown. The drive
-    keeps its own gains: they are restored when the command ends, and if it is killed, by the next connection.
+    form of both gains, and whether shown currents are peak or rms; moves at even speed say what a position gain counts
+    that its map names without a unit. What the data do not decide stays unknown. The drive keeps its own gains: they
+    are restored when the command ends, and if it is killed, by the next connection.
 
     The shaft must be free and without load. Scales rest on the inertia in the machine file and on its standard
     deviation in [std]; without one nothing that rests on the inertia is decided. Published scales of the map are
     checked. Exit code 0: everything decided; 1: a published scale is contradicted; 6: nothing decided; 10: some.
     """
     from pmsmtool.cli.consent import ask_motion
-    from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
     from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.map_gate import check_motion
@@ -78,10 +76,11 @@ def learn_command(
         gain_address,
         gain_object,
         learn_speed_loop,
+        learning_envelope,
         refuse_unsafe,
-        within_budget,
     )
-    from pmsmtool.units import rad_s_from_rpm
+    from pmsmtool.measurement.learn_position_gain import POSITION, learn_position_gain, position_gain
+    from pmsmtool.measurement.learned_rows import learned_gains
 
     asked = _addresses(names)
     file = load_machine_file(machine_path)
@@ -99,45 +98,49 @@ def learn_command(
         found = {}
         for name in (GAIN, INTEGRAL):
             found[name] = gain_object(node, name, *(asked.get(name) or gain_address(node, name)))
-        speed_max = motion.speed_max_rad_s or SPEED_SHARE * rad_s_from_rpm(machine.top_rpm)
-        i_max = within_budget(drive, machine, motion.i_max_apk or min(drive.rated_apk, drive.shows_apk), speed_max)
-        envelope = Envelope(
-            i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S, shaft=motion.shaft or "free",
-            load=motion.load, brake=motion.brake, acceleration_rad_s2=largest_acceleration(machine, i_max),
-            voltage_speed_rad_s=voltage_speed(file, i_max),
-        )  # fmt: skip
+        if POSITION in asked and (held := position_gain(node, asked[POSITION])) is not None:
+            found[POSITION] = held
+        envelope = learning_envelope(
+            drive, file, motion.i_max_apk, motion.speed_max_rad_s, motion.shaft, motion.load, motion.brake
+        )
         refuse_unsafe(node, envelope)
         lines = [
             *envelope.lines(),
             "the shaft turns at half of the speed limit and takes steps, with the drive's own speed loop",
+            *(["then it moves by two turns and back, twice, with its position loop"] if POSITION in found else []),
             *(f"{gain.name} in {gain.address} holds {gain.counts}: it is changed while the voltage is off, and restored"
               for gain in found.values()),
             "nothing is stored in the drive; every changed object is restored",
         ]  # fmt: skip
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
         measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, out.note)
+        results = learned_gains(file, measured)
+        if POSITION in found:
+            results[POSITION] = learn_position_gain(connection, node, found[POSITION], envelope, out.note)
         drive.close()
     for note in measured.notes:
         out.warn(note)
-    _tell(file, drive, measured, found, asked, output, out)
+    _tell(file, drive, measured, found, {name: results[name] for name in asked if name in results}, output, out)
 
 
 def _addresses(names: tuple[str, ...]) -> dict[str, tuple[int, int] | None]:
     """Return the wanted names with their objects, None where none is given."""
     from pmsmtool.errors import ConfigError
     from pmsmtool.measurement.learn_gains import STANDARD
+    from pmsmtool.measurement.learn_position_gain import POSITION
 
+    known = (*STANDARD, POSITION)
     asked: dict[str, tuple[int, int] | None] = {}
     for text in names:
         name, mark, where = text.partition("=")
         match = OBJECT.fullmatch(where)
-        if name not in STANDARD or (mark and match is None):
+        if name not in known or (mark and match is None):
             raise ConfigError(
                 f"{text!r} is no gain that can be learned",
-                hint=f"NAME or NAME=0xINDEX:SUB, with {' or '.join(STANDARD)}",
+                hint=f"NAME or NAME=0xINDEX:SUB, with {' or '.join(known)}",
             )
         asked[name] = (int(match[1], 16), int(match[2] or "0", 16)) if match else None
-    return asked or dict.fromkeys(STANDARD)
+    return asked or dict.fromkeys(known)
 
 
 def _tell(
@@ -145,18 +148,16 @@ def _tell(
     drive: SpeedLoopDrive,
     measured: LearnedLoop,
     found: Mapping[str, GainObject],
-    asked: Iterable[str],
+    results: Mapping[str, Learned],
     output: Path | None,
     out: Output,
 ) -> None:
     """Print what was learned, write the map, and end with the exit code it deserves."""
     from pmsmtool.drive_maps.drive_map_file import dump_drive_map
-    from pmsmtool.drive_maps.measured_rows import with_measured
     from pmsmtool.errors import CheckFailed, IdentificationError, Partial
     from pmsmtool.files import write_file
-    from pmsmtool.measurement.learned_rows import learned_gains, measured_row, shown_currents
+    from pmsmtool.measurement.learned_rows import map_with, measured_row, shown_currents
 
-    results = {name: result for name, result in learned_gains(file, measured).items() if name in asked}
     currents = shown_currents(file, measured, drive)
     rows = [measured_row(found[name], result) for name, result in results.items() if result.scale is not None]
     cells = drive.node.map.cells
@@ -178,11 +179,7 @@ def _tell(
     )  # fmt: skip
     out.result("map.learn", facts, lambda: table(heads, lines))
     if output is not None and rows and not against:
-        identity = drive.identity
-        widths = ", ".join(f"{row.name} +-{100 * row.half_width:.0f} %" for row in rows)
-        said = f"pmsmtool map learn on the drive with serial number {identity.serial}: {widths}"
-        made = with_measured(drive.node.map, identity.vendor, identity.product, rows, said, currents.kind)
-        write_file(output, dump_drive_map(made))
+        write_file(output, dump_drive_map(map_with(drive, rows, currents.kind)))
         out.note(f"wrote {output}")
     if against:
         raise CheckFailed(

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.drive.drive_node import NOT_READ, DriveNode
-from pmsmtool.drive.envelope import Envelope, largest_acceleration
+from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import WATCH_S, GuardedDrive, guarded
 from pmsmtool.drive.motion_objects import allowed, speed_limits
 from pmsmtool.drive.objects import DriveObject
@@ -27,8 +27,10 @@ from pmsmtool.flash.gain_journal import GainJournal
 from pmsmtool.flash.journal import Entry
 from pmsmtool.identification.learned_gains import Observation
 from pmsmtool.identification.speed_loop_response import SpeedLoop, StepRecord, fit_speed_loop, phase_margin_rad
-from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import Brake, Load, MachineParameters, Shaft
 from pmsmtool.measurement.speed_unit import find_speed_unit
+from pmsmtool.units import rad_s_from_rpm
 
 GAIN, INTEGRAL = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"
 STANDARD = {GAIN: (0x60F9, 1), INTEGRAL: (0x60F9, 2)}
@@ -63,6 +65,9 @@ INTEGRAL_S, LONGEST = 0.1, 2.5
 SETTLE_S = 0.8
 PATTERN = (*(0,) * 8, *(1,) * 8, *(0,) * 6, *(1,) * 4, *(0,) * 8, *(1,) * 6, *(0,) * 6)
 """Two levels of speed, held for 0.2 to 0.4 s: a loop of 25 to 200 rad/s and an integral of 2 to 40 rad/s."""
+SPEED_SHARE = 0.4
+"""Speed limit where none is asked for, of the largest speed of the machine: no field weakening."""
+DURATION_S = 120.0
 SEEN_S = 2.0 * WATCH_S
 """A speed beyond its limit is seen and the voltage off within this time."""
 REST_S, REST_RAD = 0.3, 2e-3
@@ -106,8 +111,7 @@ def gain_address(node: DriveNode, name: str) -> tuple[int, int]:
     """
     if name in node.map.cells:
         return node.map.address(name)
-    places = ADDRESS.findall(HOLDS.split(node.map.left_out.get(name, ""))[0])
-    told = [(int(index, 16), int(sub, 16)) for index, sub in places]
+    told = named_addresses(node, name)
     for address in (*told, STANDARD[name]):
         if node.has(*address):
             return address
@@ -116,6 +120,12 @@ def gain_address(node: DriveNode, name: str) -> tuple[int, int]:
         f"no object of this drive is known to hold {name}: it has no {known}", where=f"node {node.node}",
         hint=f"where its manual names one: `pmsmtool map learn {name}=0xINDEX:SUB`",
     )  # fmt: skip
+
+
+def named_addresses(node: DriveNode, name: str) -> list[tuple[int, int]]:
+    """Return the objects that the map of a drive names for a gain whose unit nobody publishes."""
+    places = ADDRESS.findall(HOLDS.split(node.map.left_out.get(name, ""))[0])
+    return [(int(index, 16), int(sub, 16)) for index, sub in places]
 
 
 def gain_object(node: DriveNode, name: str, index: int, sub: int, wire: str | None = None) -> GainObject:
@@ -199,6 +209,26 @@ def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: 
         return i_max_apk
     room = (1.0 - AIM_SHARE * (1.0 + MOST_STEP)) * speed_max_rad_s
     return i_max_apk * min(1.0, room / (acceleration * SEEN_S))
+
+
+def learning_envelope(
+    drive: SpeedLoopDrive,
+    file: MachineFile,
+    i_max_apk: float | None,
+    speed_max_rad_s: float | None,
+    shaft: Shaft | None,
+    load: Load,
+    brake: Brake,
+) -> Envelope:
+    """Return the limits within which gains are learned, from what was asked for."""
+    machine = file.machine
+    speed_max = speed_max_rad_s or SPEED_SHARE * rad_s_from_rpm(machine.top_rpm or 0.0)
+    i_max = within_budget(drive, machine, i_max_apk or min(drive.rated_apk, drive.shows_apk), speed_max)
+    return Envelope(
+        i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S, shaft=shaft or "free", load=load,
+        brake=brake, acceleration_rad_s2=largest_acceleration(machine, i_max),
+        voltage_speed_rad_s=voltage_speed(file, i_max),
+    )  # fmt: skip
 
 
 def _refuse_turning(drive: SpeedLoopDrive) -> None:

@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
-from pmsmtool.drive_maps.drive_map import LETTERS
-from pmsmtool.drive_maps.measured_rows import MeasuredRow
+from pmsmtool.drive_maps.drive_map import LETTERS, DriveMap
+from pmsmtool.drive_maps.measured_rows import MeasuredRow, with_measured
 from pmsmtool.identification.learned_gains import Convention, Learned, Rotor, convention, gain_scale, integral_scale
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import torque_per_ampere
@@ -64,3 +65,11 @@ def measured_row(gain: GainObject, found: Learned) -> MeasuredRow:
         gain.name, gain.item.index, gain.item.sub, _WIRES[gain.item.letter], found.form, other, found.scale,
         found.unit, found.half_width,
     )  # fmt: skip
+
+
+def map_with(drive: SpeedLoopDrive, rows: Sequence[MeasuredRow], kind: str | None) -> DriveMap:
+    """Return the drive's map with measured rows, which say on which drive and how well; ``kind`` of its amperes."""
+    identity = drive.identity
+    widths = ", ".join(f"{row.name} +-{100 * row.half_width:.0f} %" for row in rows)
+    said = f"pmsmtool map learn on the drive with serial number {identity.serial}: {widths}"
+    return with_measured(drive.node.map, identity.vendor, identity.product, rows, said, kind)

@@ -13,6 +13,7 @@ import pytest
 
 from pmsmtool.bus.connect import connect
 from pmsmtool.bus.connection import Connection
+from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import GuardedDrive, guarded
 from pmsmtool.drive.speed_loop_drive import Oscillation, SpeedLoopDrive
@@ -24,7 +25,7 @@ from pmsmtool.flash.gain_journal import any_left
 from pmsmtool.identification.speed_loop_response import SpeedLoop
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.measurement import learn_gains
+from pmsmtool.measurement import learn_gains, learn_position_gain
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.node.node import Node
@@ -32,6 +33,8 @@ from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import COMMON, HEARTBEAT, Row, identity, write_eds
 
 SEED = 4
+SCALE_TOL = 0.05
+"""Largest error of a position gain (relative); measured 0.01."""
 GAIN, INTEGRAL = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"
 PDO: tuple[Row, ...] = tuple(
     (base + number, sub, kind, "rw", value)
@@ -44,22 +47,22 @@ PDO: tuple[Row, ...] = tuple(
 )
 
 
-def drive_rows(*more: Row) -> tuple[Row, ...]:
+def drive_rows(*more: Row, modes: int = 0x100) -> tuple[Row, ...]:
     """A drive of CiA 402 with a cyclic velocity mode, limits, process data, and gains in 0x60F9."""
     return (
         *COMMON, *HEARTBEAT, *PDO, *identity(0x999, 1), (0x6007, 0, "I16", "rw", "2"),
         (0x6073, 0, "U16", "rw", ""), (0x6075, 0, "U32", "rw", ""), (0x6078, 0, "I16", "ro", ""),
         (0x606C, 0, "I32", "ro", ""), (0x6080, 0, "U32", "rw", ""), (0x608F, 1, "U32", "ro", "8192"),
         (0x608F, 2, "U32", "ro", "1"), (0x60FF, 0, "I32", "rw", "0"), (0x60F9, 1, "U16", "rw", "0"),
-        (0x60F9, 2, "U16", "rw", "0"), (0x6502, 0, "U32", "ro", "0x100"), *more,
+        (0x60F9, 2, "U16", "rw", "0"), (0x6502, 0, "U32", "ro", f"{modes:#x}"), *more,
     )  # fmt: skip
 
 
 class Bench:
     """A drawn drive that stays powered while commands come and go, and a machine file for it."""
 
-    def __init__(self, folder: Path, *more: Row) -> None:
-        eds = write_eds(folder / "drive.eds", drive_rows(*more))
+    def __init__(self, folder: Path, *more: Row, modes: int = 0x100) -> None:
+        eds = write_eds(folder / "drive.eds", drive_rows(*more, modes=modes))
         machine = load_machine_file(machine_path("interior-2k2"))
         machine.std["J_kgm2"] = 0.02 * machine.machine.J_kgm2  # type: ignore[index, operator]
         self.machine = folder / "machine.toml"
@@ -110,6 +113,40 @@ def test_learned_gains_are_the_drawn_ones_and_go_into_a_map(bench: Bench, tool: 
     cells = parse_drive_map((tmp_path / "mine.toml").read_text(encoding="utf-8")).cells
     assert cells[GAIN].source == "measured" and (cells[GAIN].index, cells[GAIN].sub) == drawn.gain
     assert (INTEGRAL in cells) == (found[INTEGRAL]["scale"] is not None) == (code == 0)
+
+
+POSITION_ROWS: tuple[Row, ...] = (
+    (0x6062, 0, "I32", "ro", ""), (0x607A, 0, "I32", "rw", "0"), (0x6081, 0, "U32", "rw", ""),
+    (0x6083, 0, "U32", "rw", ""), (0x6084, 0, "U32", "rw", ""), (0x60FB, 1, "U16", "rw", "0"),
+    (0x60FB, 2, "U16", "rw", "0"),
+)  # fmt: skip
+
+
+@pytest.mark.chain
+def test_a_learned_position_gain_is_the_drawn_one(tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The drive feeds the whole speed forward: that object is 0 meanwhile, else there is no lag."""
+    monkeypatch.setattr(learn_position_gain, "WAY_RAD", 9.0)
+    bench = Bench(tmp_path, *POSITION_ROWS, modes=0x101)
+    drawn, places = bench.drawn, {"position.K_p_per_s": (0x60FB, 1), "position.velocity_ff": (0x60FB, 2)}
+    named = {name: f"0x{index:04X}:{sub:02X} has no unit" for name, (index, sub) in places.items()}
+    assert bench.node.session is not None
+    forward = bench.node.session.dictionary.find(0x60FB, 2)
+    written: list[bytes] = []
+    sink = forward.sink
+    assert sink is not None
+    with connect("pmsmsim", bench.channel) as connection:
+        node = DriveNode(connection, 1, drive_map=replace(load_family("cia402"), left_out=named))
+        node.write_bytes(0x60FB, 2, round(1.0 / drawn.forward_share).to_bytes(2, "little"))
+        forward.sink = lambda data: (written.append(data), sink(data))[1]
+        before = [node.sdo.read(*place) for place in places.values()]
+        gain = learn_position_gain.position_gain(node)
+        assert gain is not None and (gain.item.index, gain.item.sub) == drawn.position
+        envelope = Envelope(i_max_apk=8.0, speed_max_rad_s=60.0, duration_s=60.0)
+        found = learn_position_gain.learn_position_gain(connection, node, gain, envelope, lambda text: None)
+        assert [node.sdo.read(*place) for place in places.values()] == before and not any_left()
+    assert found.why == "" and found.scale == pytest.approx(drawn.K_v_per_s, rel=SCALE_TOL)
+    assert written == [bytes(2), before[1]]
+    bench.holder.close()
 
 
 def test_measured_rows_make_a_map_and_check_a_published_one() -> None:

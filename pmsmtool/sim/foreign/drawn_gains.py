@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from pmsmtool.sim.foreign.behind import Behind, SetUp
+from pmsmtool.sim.foreign.behind import SPEED_RAD_S, Behind, SetUp
 from pmsmtool.sim.foreign.file_rows import MakersObjects
 from pmsmtool.sim.foreign.laws import Law
 
@@ -27,10 +27,20 @@ SPEED_OBJECTS: tuple[tuple[Address, Address], ...] = (
     ((0x60F9, 1), (0x60F9, 2)),
 )
 """Proportional and integral part of the speed loop: EPOS4, Nanotec, Faulhaber, ZeroErr; EPOS2, Copley and CiA 402."""
+POSITION_OBJECTS: tuple[tuple[Address, Address | None], ...] = (
+    ((0x3210, 1), (0x3210, 11)),
+    ((0x2382, 1), None),
+    ((0x60FB, 1), (0x60FB, 2)),
+)
+"""Position gain and feed-forward of the speed: Nanotec, ZeroErr, Copley; a controller of the position has neither."""
 SOURCE = "drawn by a seed"
 BANDWIDTH_RAD_S = (25.0, 140.0)
 INTEGRAL_RATE = (0.08, 0.35)
 """K_p / J, and K_i / K_p as a share of it: from a calm loop to a brisk one with 60 degrees of margin."""
+POSITION_RATE = (0.15, 0.3)
+"""Position gain over the bandwidth that a set-up tool leaves the speed loop in position modes."""
+FORWARD = (0.0, 0.5, 1.0)
+"""Shares of the speed that are fed forward, where the drive has an object for it."""
 FILTER_HZ = (120.0, 1000.0)
 DECIMATION = (4, 20)
 CURRENT_BANDWIDTH = (0.08, 0.3)
@@ -71,6 +81,12 @@ class DrawnGains:
         Of the speed loop.
     current_bandwidth : float
         Of the current loop, times the control period.
+    position, forward : (index, sub) or None
+        Objects of the position gain and of the feed-forward of the speed.
+    position_counts, forward_counts : int
+        What they hold at first.
+    K_v_per_s, forward_share : float
+        One count of either.
     """
 
     gain: Address
@@ -83,6 +99,12 @@ class DrawnGains:
     filter_hz: float
     decimation: int
     current_bandwidth: float
+    position: Address | None = None
+    forward: Address | None = None
+    position_counts: int = 0
+    forward_counts: int = 0
+    K_v_per_s: float = 0.0
+    forward_share: float = 0.0
 
     def K_i_nm_per_rad(self, gain: float, integral: float) -> float:
         """Return the integral gain that counts of both objects mean."""
@@ -107,6 +129,10 @@ class DrawnGains:
 
         for position, address in enumerate((self.gain, self.integral)):
             yield Law(*address, SOURCE, set_up=self.counts[position], act=taking(position))
+        if self.position is not None:
+            yield Law(*self.position, SOURCE, set_up=self.position_counts, act=self._act_on_position)
+        if self.forward is not None:
+            yield Law(*self.forward, SOURCE, set_up=self.forward_counts, act=self._act_on_forward)
         kind = RMS if self.rms else 1.0
         own = dict.fromkeys(EPOS2_CURRENTS, 1.0) if (0x2027, 0) in laws else {}
         if (0x2333, 1) in laws:
@@ -114,6 +140,12 @@ class DrawnGains:
         for address, stated in {**CURRENTS, **own}.items():
             if address in laws:
                 yield _scaled(laws[address], kind / stated)
+
+    def _act_on_position(self, behind: Behind, counts: float) -> None:
+        behind.position_gains.K_v = self.K_v_per_s * counts
+
+    def _act_on_forward(self, behind: Behind, counts: float) -> None:
+        behind.velocity_ff = self.forward_share * counts
 
 
 def _scaled(law: Law, factor: float) -> Law:
@@ -141,9 +173,28 @@ def draw_gains(seed: int, objects: MakersObjects, motor: SetUp) -> DrawnGains | 
     counts = tuple(round(_between(chance, *_room(objects, address))) for address in found)
     rate = share * bandwidth
     kept = {"parallel": K_p * rate, "rate": rate, "time": 1.0 / rate}[form]
-    return DrawnGains(
+    drawn = DrawnGains(
         *found, (counts[0], counts[1]), K_p / counts[0], kept / counts[1], form, chance.random() < 0.5,
         _between(chance, *FILTER_HZ), chance.randint(*DECIMATION), _between(chance, *CURRENT_BANDWIDTH),
+    )  # fmt: skip
+    return _with_position(drawn, chance, objects)
+
+
+def _with_position(drawn: DrawnGains, chance: random.Random, objects: MakersObjects) -> DrawnGains:
+    """Return the draw with a position gain, where the file has an object of one on a speed controller."""
+    place = next((pair for pair in POSITION_OBJECTS if objects.has(pair[0])), None)
+    if place is None or objects.has((0x2027, 0)):  # the 0x60FB of an EPOS2 is one controller of the position
+        return drawn
+    position, forward = place
+    counts = round(_between(chance, *_room(objects, position)))
+    K_v = SPEED_RAD_S * _between(chance, *POSITION_RATE) / counts
+    share = chance.choice(FORWARD)
+    if forward is None or not objects.has(forward):
+        return replace(drawn, position=position, position_counts=counts, K_v_per_s=K_v)
+    full = round(_between(chance, *_room(objects, forward)))
+    return replace(
+        drawn, position=position, position_counts=counts, K_v_per_s=K_v, forward=forward,
+        forward_counts=round(share * full), forward_share=1.0 / full,
     )  # fmt: skip
 
 

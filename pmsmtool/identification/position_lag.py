@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: MIT
+"""A drive's position gain from moves at even speed: what the shaft lags behind its demand.
+
+A position gain K_v on a speed loop with integral part turns the shaft by omega = K_v e + f omega_ref. At even speed
+that loop follows exactly, so that the lag e is (1 - f) omega / K_v, whatever inertia, friction and the speed loop are.
+The share f of the speed that the drive feeds forward is told by the current of the same moves, whose ramps change
+demanded and seen speed apart:
+
+    i = a (K_v e + f omega_ref - omega) + b (K_v int e dt + f theta_ref - theta) + c,
+
+so that f is the coefficient of omega_ref over that of -omega. A loop whose lag does not settle (an integral part of the
+position, or one controller of the position) is none of this kind.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from pmsmtool.arrays import Array
+from pmsmtool.errors import IdentificationError
+from pmsmtool.identification.learned_gains import NORMAL_95, NOT_SAME, WIDEST, Learned
+from pmsmtool.trace import Trace
+
+EVEN = 0.05
+"""Change of the demanded speed within which a move is even, of its largest."""
+WINDOW_S = 0.02
+"""Over which speeds are taken: counts of the position are no speed from one sample to the next."""
+LEAST_S = 0.4
+"""Time for which a demand must be even: the second half of it counts."""
+LEAST_COUNTS = 20.0
+"""Least lag, in counts of the position."""
+SETTLED = 0.03
+"""Largest difference of the lag in both quarters that count, relative."""
+ALIKE = 4.0
+"""Windows after one another that the rest of the current is alike in: cogging and friction are no noise."""
+LATE_S = 0.5e-3
+"""Standard deviation of the time between demand and position of one sample: half a period of a loop at 1 kHz."""
+CHANGE_STD = 0.02
+"""Of a ratio of two gains of one drive (relative)."""
+UNIT = "1/s"
+
+
+@dataclass(frozen=True, slots=True)
+class PositionLag:
+    """What moves with one gain showed.
+
+    Attributes
+    ----------
+    gain_per_s : float
+        Speed over lag (1/s).
+    std : float
+        Its standard deviation (relative).
+    forward, forward_std : float
+        Share of the demanded speed that is fed forward, and its standard deviation.
+    """
+
+    gain_per_s: float
+    std: float
+    forward: float
+    forward_std: float
+
+
+def position_lag(trace: Trace, rad_per_count: float) -> PositionLag:
+    """Return speed over lag of moves there and back.
+
+    Parameters
+    ----------
+    trace : Trace
+        As ``experiments.move.record_move`` leaves it.
+    rad_per_count : float
+        Angle of one count of the position (rad).
+
+    Raises
+    ------
+    IdentificationError
+        The moves are not even for long enough, or the lag does not settle, or it is too small to be seen.
+    """
+    t, demand, position = trace.t_s, trace["theta_ref_rad"], trace["theta_m_rad"]
+    quarters = []
+    for first, last in _even_parts(t, demand):
+        edges = np.searchsorted(t, t[first] + (t[last] - t[first]) * np.array([0.5, 0.75, 1.0]))
+        for a, b in pairwise(edges):
+            speed = float(np.polyfit(t[a:b], demand[a:b], 1)[0])
+            quarters.append((speed, float(np.mean(demand[a:b] - position[a:b]))))
+    if len(quarters) < 4:
+        raise _refused("the demand was even for too short a time", "give the drive its head: no limit below the speed")
+    speeds, lags = np.array(quarters).T
+    lags = lags * np.sign(speeds)
+    lag = float(np.mean(lags))
+    if lag < LEAST_COUNTS * rad_per_count:
+        least = f"{lag / rad_per_count:.3g} counts, {LEAST_COUNTS:g} needed"
+        raise _refused(f"the shaft lags behind its demand by {least}", "the drive feeds the speed of a move forward")
+    drift = float(np.max(np.abs(lags[1::2] - lags[::2]))) / lag
+    if drift > SETTLED:
+        raise _refused(f"the lag still changes by {100.0 * drift:.2g} % while the speed is even", "")
+    gain = float(np.mean(np.abs(speeds))) / lag
+    spread = float(np.std(lags[::2] + lags[1::2], ddof=1)) / (2.0 * lag)
+    forward, forward_std = _fed_forward(trace)
+    return PositionLag(gain, math.hypot(spread, drift, LATE_S * gain), forward, forward_std)
+
+
+def _even_parts(t: Array, demand: Array) -> Iterator[tuple[int, int]]:
+    """Yield first and last sample of every part in which the demand moves evenly at its largest speed."""
+    speed = np.abs(np.interp(t + 0.5 * WINDOW_S, t, demand) - np.interp(t - 0.5 * WINDOW_S, t, demand)) / WINDOW_S
+    even = np.flatnonzero(speed > (1.0 - EVEN) * np.quantile(speed, 0.9))
+    for part in np.split(even, np.flatnonzero(np.diff(even) > 1) + 1):
+        if part.size and t[part[-1]] - t[part[0]] > LEAST_S:
+            yield int(part[0]), int(part[-1])
+
+
+def _fed_forward(trace: Trace) -> tuple[float, float]:
+    """Return the share of the demanded speed that is fed forward, and its standard deviation."""
+    t, demand, position = trace.t_s, trace["theta_ref_rad"], trace["theta_m_rad"]
+    grid = np.arange(t[0] + WINDOW_S, t[-1] - WINDOW_S, 0.5 * WINDOW_S)
+
+    def change(x: Array) -> Array:
+        return np.interp(grid + 0.5 * WINDOW_S, t, x) - np.interp(grid - 0.5 * WINDOW_S, t, x)
+
+    lag = demand - position
+    columns = [
+        change(demand), -change(position), *(change(_integral(t, x)) for x in (_integral(t, lag), demand, position)),
+        np.ones_like(grid),
+    ]  # fmt: skip
+    matrix = np.stack(columns, axis=1)
+    size = np.sqrt(np.mean(matrix**2, axis=0))
+    current = change(_integral(t, trace["i_q_a"]))
+    found, *_ = np.linalg.lstsq(matrix / size, current, rcond=None)
+    rest = current - matrix / size @ found
+    covariance = np.linalg.inv((matrix / size).T @ (matrix / size)) * float(np.mean(rest**2)) * ALIKE
+    of_demand, of_speed = (float(found[k] / size[k]) for k in (0, 1))
+    share = of_demand / of_speed
+    gradient = np.array([1.0 / size[0], -share / size[1]]) / of_speed
+    return share, math.sqrt(float(gradient @ covariance[:2, :2] @ gradient))
+
+
+def _integral(t: Array, x: Array) -> Array:
+    return np.concatenate(([0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * np.diff(t))))
+
+
+def position_scale(own: tuple[int, PositionLag], changed: tuple[int, PositionLag], name: str) -> Learned:
+    """Return what one count of the position gain is worth (1/s), from its counts and lags before and after a change."""
+    counts, lag = own
+
+    def unknown(why: str, half_width: float = math.inf) -> Learned:
+        return Learned(name, None, half_width, None, "", why)
+
+    asked = math.log(changed[0] / counts)
+    seen = math.log(changed[1].gain_per_s / lag.gain_per_s)
+    if abs(seen - asked) > NOT_SAME * math.hypot(CHANGE_STD, lag.std, changed[1].std):
+        return unknown(f"the lag follows the counts with the exponent {-seen / asked:.2f}, not -1")
+    weights = np.array([lag.forward_std, changed[1].forward_std]) ** -2.0
+    forward = float(weights @ [lag.forward, changed[1].forward] / weights.sum())
+    forward_std = float(weights.sum()) ** -0.5
+    per_count = 0.5 * (lag.gain_per_s / counts + changed[1].gain_per_s / changed[0])
+    half = NORMAL_95 * math.hypot(lag.std, forward_std, forward, seen - asked)
+    if half > WIDEST:
+        fed = f"{100.0 * forward:.0f} +-{100.0 * NORMAL_95 * forward_std:.0f} % of the speed fed forward"
+        return unknown(f"its interval of {100.0 * half:.0f} % is too wide, with {fed}", half)
+    return Learned(name, per_count, half, "value", UNIT)
+
+
+def _refused(what: str, likely: str) -> IdentificationError:
+    return IdentificationError(
+        "E_EXCITATION", what, likely=likely or "an integral part of the position, or one controller of the position",
+        hint="the position gain stays unknown",
+    )  # fmt: skip

@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: MIT
+"""``map learn``, its second part: moves at even speed with the drive's own position gain, and with 0.7 of it.
+
+As for the speed loop: the journal is on disk before the first change, every change happens with the voltage off, and
+the only change of the gain is a step down. The feed-forward of the speed is 0 meanwhile, where it has an object.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+from pmsmtool.bus.connection import Connection
+from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.position_drive import PositionDrive
+from pmsmtool.errors import IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal
+from pmsmtool.experiments.move import record_move
+from pmsmtool.flash.gain_journal import GainJournal
+from pmsmtool.flash.journal import Entry
+from pmsmtool.identification.learned_gains import Learned
+from pmsmtool.identification.position_lag import PositionLag, position_lag, position_scale
+from pmsmtool.measurement.learn_gains import (
+    DOWN,
+    GainObject,
+    changed_counts,
+    gain_object,
+    named_addresses,
+    refuse_unsafe,
+)
+
+POSITION, FORWARD = "position.K_p_per_s", "position.velocity_ff"
+SPEED_RAD_S, RAMP_S, EVEN_S = 2.0 * math.pi, 0.25, 2.0
+"""A turn per second: cogging is even over a turn; two of them, so that gains down to 3 1/s settle."""
+WAY_RAD = SPEED_RAD_S * (EVEN_S + RAMP_S)
+SHORT_RAD = 0.5 * math.pi
+"""Way of the moves that find the drive's own profile."""
+REST_S = 1.0
+TRAVEL = 1.3
+"""Largest travel, of the way."""
+BEHIND = 0.5
+"""Largest lag of a shaft that does not follow, of the way."""
+
+
+def position_gain(node: DriveNode, address: tuple[int, int] | None = None) -> GainObject | None:
+    """Return the object of the position gain, where its map names one without a unit or the caller does; else None."""
+    where = address or _place(node, POSITION)
+    return None if where is None else gain_object(node, POSITION, *where)
+
+
+def _place(node: DriveNode, name: str) -> tuple[int, int] | None:
+    return next((address for address in named_addresses(node, name) if node.has(*address)), None)
+
+
+def learn_position_gain(
+    connection: Connection, node: DriveNode, gain: GainObject, envelope: Envelope, say: Callable[[str], None]
+) -> Learned:
+    """Return what one count of the position gain is worth, or why that stays unknown; the drive is as before.
+
+    Raises
+    ------
+    LimitExceeded, DriveTimeout
+        The shaft did not follow: the voltage is off and the gains are back.
+    """
+    try:
+        return _moved(PositionDrive(connection, node.node, drive_map=node.map), gain, envelope, say)
+    except (IdentificationError, NotAvailable, SafetyRefusal) as error:  # what was learned before stays
+        return Learned(POSITION, None, math.inf, None, "", error.what.partition("\n")[0])
+
+
+def _moved(drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Callable[[str], None]) -> Learned:
+    """Move with the gain as it is and with less of it."""
+    node = drive.node
+    refuse_unsafe(node, envelope)
+    forward = _fed_forward(node)
+    written = [gain] if forward is None else [gain, forward]
+    journal = GainJournal(
+        drive.identity, [Entry(g.name, g.item.index, g.item.sub, g.item.encode(g.counts)) for g in written]
+    )
+    drive.error_limit_rad = BEHIND * WAY_RAD
+    journal.begin()
+    try:
+        with guarded(drive, replace(envelope, travel_rad=TRAVEL * WAY_RAD), say=say) as guard:
+
+            def put(item: GainObject, counts: int) -> None:
+                data = item.item.encode(counts)
+                journal.note(item.item.index, item.item.sub, data)
+                guard.change(item.item, data)
+
+            if forward is not None:
+                put(forward, 0)
+            record_move(guard, drive, SHORT_RAD, REST_S, find=(SPEED_RAD_S, SPEED_RAD_S / RAMP_S))
+            lags: list[tuple[int, PositionLag]] = []
+            for counts in (gain.counts, changed_counts(gain, DOWN)):
+                if lags:
+                    put(gain, counts)
+                trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
+                lags.append((counts, position_lag(trace, drive.rad_per_count)))
+                say(f"{gain.address} = {counts}: speed over lag {lags[-1][1].gain_per_s:.4g} 1/s")
+            for item in written:
+                put(item, item.counts)
+    except PmsmtoolError:
+        with contextlib.suppress(PmsmtoolError):  # what is not back stays in the journal
+            journal.end(node)
+        raise
+    journal.end(node)
+    drive.close()
+    return position_scale(lags[0], lags[1], POSITION)
+
+
+def _fed_forward(node: DriveNode) -> GainObject | None:
+    """Return the feed-forward of the speed where it is not zero; None where there is no object of it."""
+    where = node.map.address(FORWARD) if FORWARD in node.map.cells else _place(node, FORWARD)
+    if where is None:
+        return None
+    try:
+        return gain_object(node, FORWARD, *where)
+    except NotAvailable:  # zero, or no whole number
+        return None
