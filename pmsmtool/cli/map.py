@@ -107,7 +107,7 @@ def learn_command(
         lines = [
             *envelope.lines(),
             "the shaft turns at half of the speed limit and takes steps, with the drive's own speed loop",
-            *(["then it moves by two turns and back, twice, with its position loop"] if POSITION in found else []),
+            *(["then it moves by three turns and back, twice, with its position loop"] if POSITION in found else []),
             *(f"{gain.name} in {gain.address} holds {gain.counts}: it is changed while the voltage is off, and restored"
               for gain in found.values()),
             "nothing is stored in the drive; every changed object is restored",

@@ -40,6 +40,8 @@ ALIKE = 4.0
 """Windows after one another that the rest of the current is alike in: cogging and friction are no noise."""
 LATE_S = 0.5e-3
 """Standard deviation of the time between demand and position of one sample: half a period of a loop at 1 kHz."""
+AGREES = 0.25
+"""Largest share that is still none: a slow speed loop and its filter made up to -0.10 of 0."""
 CHANGE_STD = 0.02
 """Of a ratio of two gains of one drive (relative)."""
 UNIT = "1/s"
@@ -142,8 +144,13 @@ def _integral(t: Array, x: Array) -> Array:
     return np.concatenate(([0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * np.diff(t))))
 
 
-def position_scale(own: tuple[int, PositionLag], changed: tuple[int, PositionLag], name: str) -> Learned:
-    """Return what one count of the position gain is worth (1/s), from its counts and lags before and after a change."""
+def position_scale(
+    own: tuple[int, PositionLag], changed: tuple[int, PositionLag], name: str, *, forward_is_zero: bool = False
+) -> Learned:
+    """Return what one count of the position gain is worth (1/s), from its counts and lags before and after a change.
+
+    ``forward_is_zero``: the drive's own object of the feed-forward is known to be 0; the current must only agree.
+    """
     counts, lag = own
 
     def unknown(why: str, half_width: float = math.inf) -> Learned:
@@ -157,7 +164,8 @@ def position_scale(own: tuple[int, PositionLag], changed: tuple[int, PositionLag
     forward = float(weights @ [lag.forward, changed[1].forward] / weights.sum())
     forward_std = float(weights.sum()) ** -0.5
     per_count = 0.5 * (lag.gain_per_s / counts + changed[1].gain_per_s / changed[0])
-    half = NORMAL_95 * math.hypot(lag.std, forward_std, forward, seen - asked)
+    known = forward_is_zero and abs(forward) < AGREES
+    half = NORMAL_95 * math.hypot(lag.std, seen - asked, 0.0 if known else math.hypot(forward_std, forward))
     if half > WIDEST:
         fed = f"{100.0 * forward:.0f} +-{100.0 * NORMAL_95 * forward_std:.0f} % of the speed fed forward"
         return unknown(f"its interval of {100.0 * half:.0f} % is too wide, with {fed}", half)

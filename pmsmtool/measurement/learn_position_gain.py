@@ -33,8 +33,8 @@ from pmsmtool.measurement.learn_gains import (
 )
 
 POSITION, FORWARD = "position.K_p_per_s", "position.velocity_ff"
-SPEED_RAD_S, RAMP_S, EVEN_S = 2.0 * math.pi, 0.25, 2.0
-"""A turn per second: cogging is even over a turn; two of them, so that gains down to 3 1/s settle."""
+SPEED_RAD_S, RAMP_S, EVEN_S = 2.0 * math.pi, 0.25, 3.0
+"""A turn per second: cogging is even over a turn; three of them, so that gains down to 3 1/s settle."""
 WAY_RAD = SPEED_RAD_S * (EVEN_S + RAMP_S)
 SHORT_RAD = 0.5 * math.pi
 """Way of the moves that find the drive's own profile."""
@@ -66,7 +66,11 @@ def learn_position_gain(
         The shaft did not follow: the voltage is off and the gains are back.
     """
     try:
-        return _moved(PositionDrive(connection, node.node, drive_map=node.map), gain, envelope, say)
+        drive = PositionDrive(connection, node.node, drive_map=node.map)
+        try:
+            return _moved(drive, gain, envelope, say)
+        finally:
+            drive.close()
     except (IdentificationError, NotAvailable, SafetyRefusal) as error:  # what was learned before stays
         return Learned(POSITION, None, math.inf, None, "", error.what.partition("\n")[0])
 
@@ -75,7 +79,7 @@ def _moved(drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Call
     """Move with the gain as it is and with less of it."""
     node = drive.node
     refuse_unsafe(node, envelope)
-    forward = _fed_forward(node)
+    forward, forward_is_zero = _fed_forward(node)
     written = [gain] if forward is None else [gain, forward]
     journal = GainJournal(
         drive.identity, [Entry(g.name, g.item.index, g.item.sub, g.item.encode(g.counts)) for g in written]
@@ -107,16 +111,17 @@ def _moved(drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Call
             journal.end(node)
         raise
     journal.end(node)
-    drive.close()
-    return position_scale(lags[0], lags[1], POSITION)
+    return position_scale(lags[0], lags[1], POSITION, forward_is_zero=forward_is_zero)
 
 
-def _fed_forward(node: DriveNode) -> GainObject | None:
-    """Return the feed-forward of the speed where it is not zero; None where there is no object of it."""
+def _fed_forward(node: DriveNode) -> tuple[GainObject | None, bool]:
+    """Return what must be set to 0 so that no speed is fed forward, and whether none is then."""
     where = node.map.address(FORWARD) if FORWARD in node.map.cells else _place(node, FORWARD)
     if where is None:
-        return None
+        return None, False
+    if not any(node.sdo.read(*where)):
+        return None, True
     try:
-        return gain_object(node, FORWARD, *where)
-    except NotAvailable:  # zero, or no whole number
-        return None
+        return gain_object(node, FORWARD, *where), True
+    except NotAvailable:  # no whole number
+        return None, False

@@ -93,6 +93,12 @@ def test_one_count_is_told_where_the_lag_follows_the_counts() -> None:
     told = position_scale((1000, lag(15.0)), (700, lag(10.5)), NAME)
     assert told.scale == pytest.approx(0.015) and told.form == "value" and told.unit == "1/s"
     assert told.half_width == pytest.approx(1.96 * math.hypot(0.005, 0.01 / math.sqrt(2.0)), rel=1e-3)
+    unsure = position_scale((1000, lag(15.0, -0.08)), (700, lag(10.5, -0.08)), NAME)
+    assert unsure.scale is None and unsure.half_width > 0.12
+    known = position_scale((1000, lag(15.0, -0.08)), (700, lag(10.5, -0.08)), NAME, forward_is_zero=True)
+    assert known.scale == pytest.approx(0.015) and known.half_width < 0.02
+    other = position_scale((1000, lag(15.0, 0.4)), (700, lag(10.5, 0.4)), NAME, forward_is_zero=True)
+    assert other.scale is None, "something else feeds the speed forward"
     as_time = position_scale((1000, lag(15.0)), (700, lag(15.0 / 0.7)), NAME)
     assert as_time.scale is None and "exponent 1.00, not -1" in as_time.why
     without_effect = position_scale((1000, lag(15.0)), (700, lag(15.0)), NAME)

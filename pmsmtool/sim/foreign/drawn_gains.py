@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from pmsmtool.sim.foreign.behind import SPEED_RAD_S, Behind, SetUp
+from pmsmtool.sim.foreign.behind import Behind, SetUp
 from pmsmtool.sim.foreign.file_rows import MakersObjects
 from pmsmtool.sim.foreign.laws import Law
 
@@ -38,7 +38,7 @@ BANDWIDTH_RAD_S = (25.0, 140.0)
 INTEGRAL_RATE = (0.08, 0.35)
 """K_p / J, and K_i / K_p as a share of it: from a calm loop to a brisk one with 60 degrees of margin."""
 POSITION_RATE = (0.15, 0.3)
-"""Position gain over the bandwidth that a set-up tool leaves the speed loop in position modes."""
+"""Position gain over the bandwidth of the speed loop."""
 FORWARD = (0.0, 0.5, 1.0)
 """Shares of the speed that are fed forward, where the drive has an object for it."""
 FILTER_HZ = (120.0, 1000.0)
@@ -123,7 +123,9 @@ class DrawnGains:
         def taking(position: int) -> Callable[[Behind, float], None]:
             def act(behind: Behind, counts: float) -> None:
                 held[position] = counts
-                behind.set_speed_gains(self.K_p_nms_per_rad * held[0], self.K_i_nm_per_rad(*held))
+                K_p, K_i = self.K_p_nms_per_rad * held[0], self.K_i_nm_per_rad(*held)
+                behind.set_speed_gains(K_p, K_i)
+                behind.position_gains.K_p, behind.position_gains.K_i = K_p, K_i
 
             return act
 
@@ -177,17 +179,17 @@ def draw_gains(seed: int, objects: MakersObjects, motor: SetUp) -> DrawnGains | 
         *found, (counts[0], counts[1]), K_p / counts[0], kept / counts[1], form, chance.random() < 0.5,
         _between(chance, *FILTER_HZ), chance.randint(*DECIMATION), _between(chance, *CURRENT_BANDWIDTH),
     )  # fmt: skip
-    return _with_position(drawn, chance, objects)
+    return _with_position(drawn, bandwidth, chance, objects)
 
 
-def _with_position(drawn: DrawnGains, chance: random.Random, objects: MakersObjects) -> DrawnGains:
+def _with_position(drawn: DrawnGains, bandwidth: float, chance: random.Random, objects: MakersObjects) -> DrawnGains:
     """Return the draw with a position gain, where the file has an object of one on a speed controller."""
     place = next((pair for pair in POSITION_OBJECTS if objects.has(pair[0])), None)
     if place is None or objects.has((0x2027, 0)):  # the 0x60FB of an EPOS2 is one controller of the position
         return drawn
     position, forward = place
     counts = round(_between(chance, *_room(objects, position)))
-    K_v = SPEED_RAD_S * _between(chance, *POSITION_RATE) / counts
+    K_v = bandwidth * _between(chance, *POSITION_RATE) / counts
     share = chance.choice(FORWARD)
     if forward is None or not objects.has(forward):
         return replace(drawn, position=position, position_counts=counts, K_v_per_s=K_v)
