@@ -3,12 +3,18 @@
 
     python -m benchmarks.mutations --count 60
     python -m benchmarks.mutations --count 60 --only 3 17      # survivors again, by their numbers
+    python -m benchmarks.mutations --count 20 --numbers        # numbers instead of operators
+    python -m benchmarks.mutations --rooms flash --unseen      # operators that no test can notice, without mutations
 
 The mutations are drawn from the hash of the present commit, each with the same chance over all operators of the rooms:
-comparisons, arithmetic, ``and``/``or``, ``not``, and numbers, in Python by its syntax tree and in C by its tokens. Each
-is made in a copy of the commit, of which only the room's own tests run, first those that enter the changed function. A
-mutation is caught when a test fails, when one needs more than ten times what it needs without it, or when the C does
-not compile.
+comparisons, arithmetic, ``and``/``or`` and ``not``, in Python by its syntax tree and in C by its tokens; the numbers
+of the Python sources are a draw of their own. Each is made in a copy of the commit, of which only the room's own tests
+run. A mutation is caught when a test fails, when one needs more than ten times what it needs without it, or when the
+C does not compile.
+
+In Python the tests run once before with every drawn place watched: it computes both what is written and the mutation,
+and notes for each test whether they differ anywhere, in programs that the test starts as well. Only those tests run
+with the mutation; no other can notice it. C whose compiled bytes are those without the mutation survives at once.
 """
 
 from __future__ import annotations
@@ -24,16 +30,17 @@ import re
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
+from typing import cast
 
 import pytest
+
+from pmsmtool.packaging.kernels import KERNELS
 
 ROOT = Path(__file__).parent.parent
 ROOMS = {
@@ -56,18 +63,17 @@ _TOKEN = re.compile(
     re.DOTALL | re.MULTILINE,
 )
 LONGEST_S = 1800.0
-WATCH = "PMSMTOOL_WATCHED_TESTS"
-_PACKAGE = str(ROOT / "pmsmtool") + "/"
+PLACES, REPORT = "PMSMTOOL_WATCHED_PLACES", "PMSMTOOL_WATCHED_TESTS"
 
 
 @dataclass(frozen=True, slots=True)
 class Test:
-    """A test, its time, the functions it entered (path, first line), and the text of its file."""
+    """A test, its time, the numbers of the mutations it can notice, and the text of its file."""
 
     number: int
     node: str
     seconds: float
-    entered: frozenset[tuple[str, int]]
+    seen: frozenset[int]
     text: str
 
     @property
@@ -85,6 +91,11 @@ class Mutation:
     before: str
     after: str
 
+    @property
+    def of_number(self) -> bool:
+        """Whether it changes a number, not an operator."""
+        return self.before[0].isdigit() or self.before[0] == "."
+
     def of(self, text: str) -> str:
         """Return the changed text."""
         return text[: self.at] + self.after + text[self.at + len(self.before) :]
@@ -95,8 +106,8 @@ class Mutation:
         return f"{self.path}:{number}: {text.splitlines()[number - 1].strip()}   [{self.before} -> {self.after}]"
 
 
-def in_python(path: Path, text: str) -> Iterator[Mutation]:
-    """Yield the mutations of a Python file."""
+def in_python(path: Path, text: str, tree: ast.Module) -> Iterator[tuple[ast.expr, Mutation]]:
+    """Yield the mutations of a Python file, each with its expression in the file's tree."""
     starts = [0]
     for line in text.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
@@ -112,19 +123,7 @@ def in_python(path: Path, text: str) -> Iterator[Mutation]:
         if found:
             yield Mutation(path, begin + found.start(), symbol, other)
 
-    tree = ast.parse(text)
-    hidden = {
-        id(inner)
-        for node in ast.walk(tree)
-        for name in ("annotation", "returns", "decorator_list")
-        for part in [getattr(node, name, None)]
-        for top in (part if isinstance(part, list) else [part])
-        if isinstance(top, ast.AST)
-        for inner in ast.walk(top)
-    }
-    for node in ast.walk(tree):
-        if id(node) in hidden:
-            continue
+    def of(node: ast.AST) -> Iterator[Mutation]:
         if isinstance(node, ast.Compare):
             for left, operator, right in zip([node.left, *node.comparators], node.ops, node.comparators, strict=False):
                 symbol = SYMBOLS.get(type(operator))
@@ -141,10 +140,59 @@ def in_python(path: Path, text: str) -> Iterator[Mutation]:
             yield Mutation(path, position(node.lineno, node.col_offset), "not ", "")
         elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
             if isinstance(node.value, bool):
-                continue
+                return
             at = position(node.lineno, node.col_offset)
             literal = text[at : position(node.end_lineno or 0, node.end_col_offset or 0)]
             yield Mutation(path, at, literal, f"({literal} + 1)" if abs(node.value) <= 1 else f"({literal} * 2)")
+
+    hidden: set[int] = set()
+    for node in ast.walk(tree):
+        for name in ("annotation", "returns", "decorator_list"):
+            part = getattr(node, name, None)
+            for top in part if isinstance(part, list) else [part]:
+                hidden |= {id(inner) for inner in ast.walk(top)} if isinstance(top, ast.AST) else set()
+    for node in ast.walk(tree):
+        if id(node) not in hidden and isinstance(node, ast.expr):
+            yield from ((node, each) for each in of(node))
+
+
+class _Watching(ast.NodeTransformer):
+    """Puts a watch around the expressions of some mutations (by the expression's id: numbers and mutations)."""
+
+    def __init__(self, places: Mapping[int, list[tuple[int, Mutation]]]) -> None:
+        self.places = places
+
+    def visit(self, node: ast.AST) -> ast.AST:
+        """Watch a node, its inner ones first; the patterns of a ``match`` and what makes a type are left alone."""
+        places = self.places.get(id(node), [])
+        new = node if isinstance(node, ast.pattern) else self.generic_visit(node)
+        if isinstance(new, ast.BinOp) or (isinstance(new, ast.Compare) and len(new.ops) == 1):
+            left, right = (new.left, new.right) if isinstance(new, ast.BinOp) else (new.left, new.comparators[0])
+            for number, mutation in places:
+                what = [ast.Constant(each) for each in (number, mutation.before, mutation.after)]
+                return ast.Call(_name("computed"), [*what, left, right], [])
+        for number, _ in places:
+            new = ast.Call(_name("reached"), [ast.Constant(number), cast(ast.expr, new)], [])
+        return new
+
+
+def _name(function: str) -> ast.expr:
+    return ast.Attribute(ast.Name("_watched_places", ast.Load()), function, ast.Load())
+
+
+def watching(text: str, mutations: Mapping[int, Mutation]) -> str:
+    """Return the text of a Python file with some of its mutations watched under their numbers."""
+    path = next(iter(mutations.values())).path
+    numbers = {mutation: number for number, mutation in mutations.items()}
+    tree = ast.parse(text)
+    places: dict[int, list[tuple[int, Mutation]]] = {}
+    for node, mutation in in_python(path, text, tree):
+        if mutation in numbers:
+            places.setdefault(id(node), []).append((numbers[mutation], mutation))
+    new = cast(ast.Module, _Watching(places).visit(tree))
+    futures = [k for k, node in enumerate(new.body) if isinstance(node, ast.ImportFrom) and node.module == "__future__"]
+    new.body[max(futures, default=-1) + 1 : 0] = ast.parse("import benchmarks.watched_places as _watched_places").body
+    return ast.unparse(ast.fix_missing_locations(new))
 
 
 def in_c(path: Path, text: str) -> Iterator[Mutation]:
@@ -156,67 +204,69 @@ def in_c(path: Path, text: str) -> Iterator[Mutation]:
             yield Mutation(path, found.start(), symbol, other)
 
 
-def drawn(folder: Path, count: int, seed: int) -> list[tuple[str, Mutation]]:
-    """Return mutations with their rooms, drawn without repetition."""
-    sites: list[tuple[str, Mutation]] = []
-    for room in ROOMS:
+def places(folder: Path, rooms: Sequence[str], numbers: bool) -> list[tuple[str, Mutation]]:
+    """Return all mutations of operators, or of numbers, with their rooms."""
+    found: list[tuple[str, Mutation]] = []
+    for room in rooms:
         for path in sorted((folder / room).rglob("*.[pch]*")):
             if path.suffix in (".py", ".c", ".h"):
-                text = path.read_text(encoding="utf-8")
-                make = in_python if path.suffix == ".py" else in_c
-                sites += [(room, mutation) for mutation in make(path.relative_to(folder), text)]
-    return random.Random(seed).sample(sites, count)
+                text, name = path.read_text(encoding="utf-8"), path.relative_to(folder)
+                python = path.suffix == ".py"
+                made = (each for _, each in in_python(name, text, ast.parse(text))) if python else in_c(name, text)
+                found += [(room, mutation) for mutation in made if mutation.of_number == numbers]
+    return found
 
 
-def place(text: str, at: int) -> int:
-    """Return the first line of the innermost Python function around a place, 0 where none is."""
-    line = text.count("\n", 0, at) + 1
-    starts = [0]
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.FunctionDef) and node.lineno <= line <= (node.end_lineno or 0):
-            starts.append(min([node.lineno, *(each.lineno for each in node.decorator_list)]))
-    return max(starts)
+def in_turn(tests: Sequence[Test], number: int, mutation: Mutation) -> list[Test]:
+    """Return the tests that can notice a mutation, quick ones first, then by files, whose tests share fixtures.
 
-
-def in_turn(tests: Sequence[Test], mutation: Mutation, text: str) -> list[list[Test]]:
-    """Return the tests that can notice a mutation, in runs one after the other, quick files first.
-
-    Those that entered the mutated function; the others of their files, which share fixtures, and those that start
-    programs; and where a constant or C is mutated, whose use nobody watches, all others. What is left out never comes
-    to the changed line.
+    What one test has noticed, the others of its file may through what the file computes once. In C nobody looks; first
+    come the tests whose file speaks of the mutated one.
     """
-    name = str(mutation.path)
-    first = place(text, mutation.at) if mutation.path.suffix == ".py" else 0
+    of_c = mutation.path.suffix != ".py"
+    seen = {test for test in tests if number in test.seen}
+    sharing = {test.file for test in seen if re.search(r"\bscope=|\bcache\b", test.text)}
+    chosen = [test for test in tests if of_c or test in seen or test.file in sharing]
     cost: dict[str, float] = {}
-    for test in tests:
+    for test in chosen:
         cost[test.file] = cost.get(test.file, 0.0) + test.seconds
 
-    def enters(test: Test) -> bool:
-        if mutation.path.suffix != ".py":
-            return mutation.path.stem in test.file + test.text
-        return (name, first) in test.entered if first else any(path == name for path, _ in test.entered)
+    def turn(test: Test) -> tuple[bool, bool, float, int]:
+        return (
+            test.seconds > 1.0,
+            of_c and mutation.path.stem not in test.file + test.text,
+            cost[test.file],
+            test.number,
+        )
 
-    entering = {test for test in tests if enters(test)}
-    files = {test.file for test in entering}
-    beside = {test for test in tests if test.file in files or "subprocess" in test.text or "served" in test.text}
-    runs = [entering, beside - entering, set() if first else set(tests) - beside - entering]
-    return [sorted(run, key=lambda test: (cost[test.file], test.number)) for run in runs]
+    return sorted(chosen, key=turn)
 
 
-def watched(folder: Path, room: str) -> list[Test]:
-    """Run the tests of a room as they are; return them with their times and the room's functions that each entered."""
+def watched(folder: Path, room: str, mutations: Mapping[int, Mutation]) -> list[Test]:
+    """Run the tests of a room with the Python mutations watched; return them with their times and what each notices."""
+    by_file: dict[Path, dict[int, Mutation]] = {}
+    for number, mutation in mutations.items():
+        if mutation.path.suffix == ".py":
+            by_file.setdefault(mutation.path, {})[number] = mutation
+    for path, some in by_file.items():
+        (folder / path).write_text(watching((folder / path).read_text(encoding="utf-8"), some), encoding="utf-8")
     with tempfile.TemporaryDirectory() as name:
-        report = Path(name) / "watched.json"
-        environment = {**_environment(folder), WATCH: str(report)}
+        report, noted = Path(name) / "watched.json", Path(name) / "noted"
+        noted.write_bytes(bytes(max(mutations, default=0) + 1))
+        environment = {**_environment(folder), PLACES: str(noted), REPORT: str(report)}
         done = _pytest(folder, [ROOMS[room], "-p", "benchmarks.mutations"], environment, LONGEST_S)
-        if done.returncode:
-            sys.exit(f"{ROOMS[room]} fails without a mutation\n{done.stdout[-2000:]}")
-        rows = json.loads(report.read_text(encoding="utf-8"))
+        subprocess.run(["git", "checkout", "-q", "--", "pmsmtool"], cwd=folder, check=True)
+        if not report.exists() or not (rows := json.loads(report.read_text(encoding="utf-8"))):
+            sys.exit(f"{ROOMS[room]} cannot be watched\n{done.stdout[-2000:]}")
     texts = {path: (folder / path).read_text(encoding="utf-8") for path in {row[0].split("::")[0] for row in rows}}
-    return [
-        Test(k, node, seconds, frozenset((path, line) for path, line in entered), texts[node.split("::")[0]])
-        for k, (node, seconds, entered) in enumerate(rows)
+    tests = [
+        Test(k, node, seconds, frozenset(seen) if passed else frozenset(mutations), texts[node.split("::")[0]])
+        for k, (node, seconds, passed, seen) in enumerate(rows)
     ]
+    upset = [test for test, (_, _, passed, _) in zip(tests, rows, strict=True) if not passed]
+    if not passes(folder, upset):
+        sys.exit(f"{ROOMS[room]} fails without a mutation: one of {', '.join(test.node for test in upset)}")
+    return tests
 
 
 def passes(folder: Path, tests: Sequence[Test]) -> bool:
@@ -228,14 +278,14 @@ def passes(folder: Path, tests: Sequence[Test]) -> bool:
         names.write_text("\n".join(test.node for test in tests), encoding="utf-8")
         longest = 10.0 * max(test.seconds for test in tests) + 10.0
         limit_s = min(LONGEST_S, 10.0 * sum(test.seconds for test in tests) + 30.0)
-        arguments = [f"@{names}", "-o", f"timeout={longest:.0f}"]
+        arguments = ["-x", f"@{names}", "-o", f"timeout={longest:.0f}"]
         return _pytest(folder, arguments, _environment(folder), limit_s).returncode == 0
 
 
 def _pytest(
     folder: Path, arguments: list[str], environment: dict[str, str], limit_s: float
 ) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
     command += ["-o", "addopts=--import-mode=importlib", "-m", "not wall_clock and not slow_install", *arguments]
     try:
         return subprocess.run(
@@ -245,36 +295,36 @@ def _pytest(
         return subprocess.CompletedProcess(command, 1, "", "")
 
 
-def survives(folder: Path, tests: Sequence[Test], mutation: Mutation) -> bool:
+def survives(folder: Path, tests: Sequence[Test], number: int, mutation: Mutation) -> bool:
     """Make a mutation, run the tests, take it back."""
     path = folder / mutation.path
     text = path.read_text(encoding="utf-8")
+    before = _libraries(folder)
     path.write_text(mutation.of(text), encoding="utf-8")
     try:
-        built = path.suffix == ".py" or _built(folder)
-        return built and all(passes(folder, some) for some in in_turn(tests, mutation, text))
+        if path.suffix != ".py" and (not _built(folder) or _libraries(folder) == before):
+            return _libraries(folder) == before
+        return passes(folder, in_turn(tests, number, mutation))
     finally:
         path.write_text(text, encoding="utf-8")
         if path.suffix != ".py":
             _built(folder)
 
 
+def _libraries(folder: Path) -> list[bytes]:
+    return [path.read_bytes() for path in sorted((folder / "pmsmtool/_native").glob("*.so"))]
+
+
 class _Watch:
-    """A pytest plug-in: how long each test takes and which of the package's functions it enters."""
+    """A pytest plug-in: how long each test takes and which watched places it notices."""
 
     def __init__(self, report: Path) -> None:
-        self.report = report
-        self.rows: list[tuple[str, float, list[tuple[str, int]]]] = []
-        self.at_import: set[tuple[str, int]] | None = None
-        self.entered: set[tuple[str, int]] = set()
-        sys.settrace(self.called)
+        from benchmarks.watched_places import NOTED
 
-    def called(self, frame: FrameType, event: str, argument: object) -> None:
-        """Note a call; a trace function."""
-        del event, argument
-        code = frame.f_code
-        if code.co_filename.startswith(_PACKAGE):
-            self.entered.add((code.co_filename[len(_PACKAGE) - len("pmsmtool/") :], code.co_firstlineno))
+        self.report, self.noted = report, NOTED
+        self.rows: list[tuple[str, float, bool, list[int]]] = []
+        self.at_import: bytes | None = None
+        self.passed = True
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:
@@ -283,16 +333,19 @@ class _Watch:
             for thing in vars(module).values():
                 getattr(thing, "cache_clear", int)()
         if self.at_import is None:
-            self.at_import = self.entered
-        self.entered = set(self.at_import)
+            self.at_import = self.noted[:]
+        self.noted[:] = self.at_import
+        self.passed = True
         begun = time.monotonic()
-        threading.settrace(self.called)
-        sys.settrace(self.called)
         try:
             return (yield)
         finally:
-            sys.settrace(None)
-            self.rows.append((item.nodeid, time.monotonic() - begun, sorted(self.entered)))
+            seen = [number for number, byte in enumerate(self.noted[:]) if byte]
+            self.rows.append((item.nodeid, time.monotonic() - begun, self.passed, seen))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """Note a test that fails because of the watch: it may notice everything."""
+        self.passed = self.passed and not report.failed
 
     def pytest_sessionfinish(self) -> None:
         """Write what was seen."""
@@ -301,11 +354,12 @@ class _Watch:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Watch the tests where the benchmark asks for it."""
-    config.pluginmanager.register(_Watch(Path(os.environ[WATCH])))
+    config.pluginmanager.register(_Watch(Path(os.environ[REPORT])))
 
 
 def _built(folder: Path) -> bool:
-    command = [sys.executable, "-m", "pmsmtool.packaging.build_kernels"]
+    kernels = [kernel.name for kernel in KERNELS]
+    command = [sys.executable, "-m", "pmsmtool.packaging.build_kernels", *kernels]
     done = subprocess.run(command, cwd=folder, env=_environment(folder), capture_output=True, check=False)
     return done.returncode == 0
 
@@ -318,7 +372,10 @@ def main() -> None:
     """Run the program."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=60)
+    parser.add_argument("--numbers", action="store_true", help="change numbers of the Python sources, not operators")
+    parser.add_argument("--rooms", nargs="*", default=[], help="parts of the rooms' paths; default all of them")
     parser.add_argument("--only", type=int, nargs="*", help="numbers of the drawn ones to run")
+    parser.add_argument("--unseen", action="store_true", help="list what no test can notice, without mutations")
     parser.add_argument("--jobs", type=int, default=2, help="mutations at a time, each in its own copy")
     asked = parser.parse_args()
     commit = subprocess.run(
@@ -333,10 +390,12 @@ def main() -> None:
             if not _built(folder):
                 sys.exit("the kernels cannot be built in the copy")
             copies.put(folder)
-        chosen = [(k, *each) for k, each in enumerate(drawn(folder, asked.count, seed))]
-        if asked.only is not None:
-            chosen = [each for each in chosen if each[0] in asked.only]
-        print(f"commit {commit[:12]}: {len(chosen)} mutations", flush=True)
+        rooms = [room for room in ROOMS if not asked.rooms or any(part in room for part in asked.rooms)]
+        found = places(folder, rooms, asked.numbers)
+        drawn = found if asked.unseen else random.Random(seed).sample(found, asked.count)
+        chosen = [(k, *each) for k, each in enumerate(drawn) if asked.only is None or k in asked.only]
+        what = "numbers" if asked.numbers else "operators"
+        print(f"commit {commit[:12]}: {len(chosen)} of {len(found)} {what}", flush=True)
 
         @contextmanager
         def a_copy() -> Iterator[Path]:
@@ -348,24 +407,33 @@ def main() -> None:
 
         def watch(room: str) -> list[Test]:
             with a_copy() as folder:
-                return watched(folder, room)
+                return watched(folder, room, {k: mutation for k, where, mutation in chosen if where == room})
+
+        def text_of(mutation: Mutation) -> str:
+            return mutation.line((ROOT / mutation.path).read_text(encoding="utf-8"))
 
         def one(number: int, room: str, mutation: Mutation) -> bool:
-            line = mutation.line((ROOT / mutation.path).read_text(encoding="utf-8"))
             with a_copy() as folder:
                 begun = time.monotonic()
-                alive = survives(folder, tests[room], mutation)
+                alive = survives(folder, tests[room], number, mutation)
             seconds = time.monotonic() - begun
-            print(f"{number:3d} {'SURVIVES' if alive else 'caught  '} {seconds:4.0f} s  {line}", flush=True)
+            verdict = "SURVIVES" if alive else "caught  "
+            print(f"{number:3d} {verdict} {seconds:4.0f} s  {text_of(mutation)}", flush=True)
             return alive
 
         rooms = sorted({room for _, room, _ in chosen})
         tests = dict(zip(rooms, pool.map(watch, rooms), strict=True))
         for room in rooms:
             print(f"{room}: {len(tests[room])} tests, {sum(test.seconds for test in tests[room]):.0f} s", flush=True)
+        if asked.unseen:
+            seen = frozenset().union(*(test.seen for some in tests.values() for test in some))
+            for k, _, mutation in chosen:
+                if k not in seen and mutation.path.suffix == ".py":
+                    print(text_of(mutation))
+            return
         alive = sum(pool.map(lambda each: one(*each), chosen))
     caught = len(chosen) - alive
-    print(f"{caught} of {len(chosen)} caught ({100.0 * caught / len(chosen):.0f} %)")
+    print(f"{caught} of {len(chosen)} {what} caught ({100.0 * caught / len(chosen):.0f} %)")
 
 
 if __name__ == "__main__":
