@@ -87,8 +87,7 @@ def operating_cells(source: MachineFile, rated: Ratings, voltage_margin: float) 
     speed = np.broadcast_to(table.y, known.shape)[known]
     psi_d, psi_q = machine.flux(i_d, i_q)
     if source.flux_map is None:
-        ones = np.ones_like(i_d)
-        jacobian = np.array([machine.L_d * ones, 0.0 * ones, 0.0 * ones, machine.L_q * ones])
+        jacobian = np.tile([[machine.L_d], [0.0], [0.0], [machine.L_q]], i_d.size)
     else:
         jacobian = source.flux_map.incremental_inductance(i_d, i_q).reshape(4, -1)
     achieved = table.achieved_torque_nm[..., 0][known]

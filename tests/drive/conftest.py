@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 
 from tests.drive.recorder_rig import KINDS, Opener, Rig, rig_of
+from tests.recorded_results import recorded
+
+__all__ = ["opened", "recorded"]
 
 
 @pytest.fixture(params=KINDS)

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: MIT
+"""Values that lie on a bound, and closed forms of the rarer branches."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators import estimate as gates
+from pmsmtool.estimators.cross_check import JUDGES, CrossCheck
+from pmsmtool.estimators.flux import linkage_rows
+from pmsmtool.estimators.flux.voltage_flux import current_rise
+from pmsmtool.estimators.injection.inductance import _pulse_height
+from pmsmtool.estimators.injection.sampling_instant import Sampling
+from pmsmtool.estimators.injection.switching_ripple import Modulation
+from pmsmtool.estimators.noise import MINIMUM_SAMPLES, estimate_noise
+from pmsmtool.estimators.resistance import Copper, copper_of, resistance_warmed
+from pmsmtool.estimators.sensor_mismatch import LEAST, SURE, SensorMismatch
+from pmsmtool.estimators.shaft.motion import DECAY_MOST, _coast, _stops_after, positions
+from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.temperature import WINDING_TOLERANCE
+from pmsmtool.trace import Trace
+
+PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "interior-2k2.toml"
+ROUNDING = 1e-12  # relative; measured 4e-16
+
+
+def trace(t: np.ndarray, **signals: list[float] | np.ndarray) -> Trace:
+    arrays = {name: np.asarray(values, dtype=float) for name, values in signals.items()}
+    return Trace(t, arrays, dict.fromkeys(arrays, "1"), {"i_command_a": 4.0})
+
+
+def test_a_limit_is_within_it() -> None:
+    assert gates.chi2_gate(gates.CHI2_WARN, "x")[0] is gates.Verdict.PASS
+    assert gates.chi2_gate(gates.CHI2_REFUSE, "x") == (gates.Verdict.WARN, math.sqrt(gates.CHI2_REFUSE))
+    gates.condition_gate(5.0, "a and b", "x", limit=5.0)
+    assert gates.coverage_factor(1e4) > gates.COVERAGE_FACTOR  # 1.9602 of Student, 1.9600 of Gauss
+    assert gates.coverage_factor(1.0) == pytest.approx(12.7062, abs=1e-4)
+    nothing = Estimate(1.0, 0.1, 0.0, "H")
+    assert CrossCheck("a", "b", nothing, -0.2, 0.2).agrees
+    assert CrossCheck("a", "b", nothing, 0.0, JUDGES).verdict.startswith("agrees")
+    small, unsure = SensorMismatch((LEAST, -LEAST, 0.0), 0.0), SensorMismatch((SURE * 0.01, -SURE * 0.01, 0.0), 0.01)
+    assert not small.corrected and not unsure.corrected
+
+
+def test_the_least_samples_are_enough_for_the_noise() -> None:
+    rng = np.random.default_rng(1)
+
+    def record(n: int) -> Trace:
+        return trace(1e-4 * np.arange(n), i_d_a=rng.normal(0.0, 0.1, n), i_q_a=rng.normal(0.0, 0.1, n))
+
+    estimate_noise(record(MINIMUM_SAMPLES))
+    with pytest.raises(IdentificationError, match="E_EXCITATION"):
+        estimate_noise(record(MINIMUM_SAMPLES - 1))
+
+
+def test_what_a_leg_swings_beyond_the_link_scales_the_voltage() -> None:
+    assert gates.SensorTolerance(voltage_scale=1.25, bridge_difference_v=2.0, U_dc_v=100.0).applied_scale == 1.275
+    assert gates.SensorTolerance(voltage_scale=1.25, U_dc_v=100.0).applied_scale == 1.25
+    assert _pulse_height(0.0, "d", 300.0) == pytest.approx(200.0, rel=ROUNDING)  # legs at 1, -1/2, -1/2
+    assert _pulse_height(0.0, "q", 300.0) == pytest.approx(300.0 / math.sqrt(3.0), rel=ROUNDING)
+
+
+def test_the_winding_of_a_file() -> None:
+    file = load_machine_file(PROFILE)
+    machine = replace(file.machine, R_winding_ohm=3.0)
+    name = "R_winding_ohm"
+    assert copper_of(replace(file, machine=machine, std={}, systematic={})).winding_half_ohm == WINDING_TOLERANCE * 3.0
+    stated = replace(file, machine=machine, std={name: 0.1}, systematic={name: 0.05})
+    assert copper_of(stated).winding_half_ohm == pytest.approx(0.1 * gates.COVERAGE_FACTOR + 0.05, rel=ROUNDING)
+    assert copper_of(replace(file, machine=replace(machine, R_winding_ohm=None), std={})).winding_half_ohm == 0.0
+
+
+def test_a_resistance_follows_its_copper() -> None:
+    """Copper alone: R (235 + T)/(235 + T_R); with devices, only the copper's share of it."""
+    alpha = 1.0 / (235.0 + 20.0)
+    R = Estimate(2.0, 0.01, 0.0, "ohm", T_c=30.0)
+    assert resistance_warmed(R, 80.0, Copper(20.0, alpha)) == pytest.approx(2.0 * 315.0 / 265.0, rel=ROUNDING)
+    shared = resistance_warmed(R, 80.0, Copper(20.0, alpha, R_winding_ohm=1.5))
+    assert shared == pytest.approx(0.5 + 1.5 * 315.0 / 265.0, rel=ROUNDING)
+    assert resistance_warmed(R, math.nan, Copper(20.0, alpha)) == 2.0
+
+
+def test_motion_without_viscous_friction_is_a_parabola() -> None:
+    J, drive, omega, t = 0.5, -4.0, 3.0, 0.2
+    assert _coast(omega, drive, 0.0, J, t) == pytest.approx((omega * t + drive * t * t / (2.0 * J), 1.4), rel=ROUNDING)
+    assert _stops_after(omega, drive, 0.0, J) == pytest.approx(0.375, rel=ROUNDING)
+    assert _stops_after(2.0, -4.0, -2.0, J) == math.inf  # negative friction holds it: it never stops
+
+
+@pytest.mark.parametrize("x", [1.0, DECAY_MOST])
+def test_a_shaft_that_decays_within_the_record(x: float) -> None:
+    """theta = omega J/B (1 - e^(-B t/J)), also where e^(B t/J) is beyond every number."""
+    n, T, omega = 200, 1.0, 3.0
+    found = positions(np.zeros(n), T, np.array([0.0, x, 0.0, 0.5, omega]))
+    assert found == pytest.approx(0.5 - omega / x * np.expm1(-x * T * np.arange(n + 1.0)), rel=1e-9)  # measured 1e-15
+
+
+def test_pairs_hold_one_size_in_both_directions() -> None:
+    def pairs(i_d: tuple[float, float], i_q: float = 0.0, w: tuple[float, float] = (10.0, 9.0)) -> int:
+        rows = trace(np.arange(2.0), i_d_a=list(i_d), i_q_a=[0.0, i_q], omega_e_rad_s=list(w))
+        return len(linkage_rows.pairs_of(rows))
+
+    assert pairs((-5.0, 5.0)) == 1
+    assert pairs((-5.0, linkage_rows.PAIR_RATIO * 5.0)) == 0
+    assert pairs((-5.0, 5.0), i_q=linkage_rows.Q_SHARE * 5.0) == 0
+    assert pairs((-5.0, 5.0), w=(10.0, 0.0)) == 0
+    assert pairs((-5.0, 5.0), w=(10.0, -9.0)) == 0
+
+
+def test_the_course_of_the_current_within_a_period() -> None:
+    """A late sample sees another flux of i_d, w^2 psi ((t - T/2)^2 - T^2/12)/2; u_q holds its change times w."""
+    T, w, psi, L = 1e-4, np.array([400.0, -500.0]), 0.5, (5e-3, 8e-3)
+    one = np.ones(2)
+    speeds = trace(np.arange(2.0), i_d_a=3.0 * one, i_q_a=0.0 * one, u_d_v=0.0 * one, u_q_v=w * psi,
+                   omega_e_rad_s=w, omega_first_rad_s=w, omega_second_rad_s=w, half_s=one)  # fmt: skip
+    switched = Modulation(500.0, L, T, 0.0)
+    late = linkage_rows.corrected(speeds, 0.0, T, None, switched, 0.0, Sampling(0.25 * T))
+    fresh = linkage_rows.corrected(speeds, 0.0, T, None, switched, 0.0)
+    of_instant = [0.5 * w**2 * psi * T**2 * (a - 1.0 / 12.0) for a in (1.0 / 16.0, 1.0 / 4.0)]
+    assert late.u_q - fresh.u_q == pytest.approx(w * (of_instant[0] - of_instant[1]), rel=1e-6)
+
+
+def test_a_current_that_rises() -> None:
+    assert current_rise(trace(np.arange(4.0), i_q_a=[1.0, 1.0, 2.0, 2.0])) == 0.25

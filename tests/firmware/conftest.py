@@ -1,0 +1,6 @@
+# SPDX-License-Identifier: MIT
+"""Every test here is watched by :mod:`tests.recorded_results`."""
+
+from tests.recorded_results import recorded
+
+__all__ = ["recorded"]
