@@ -67,7 +67,7 @@ def check_family(drive_map: DriveMap, identity: Identity) -> None:
 def check_nodes(drive_map: DriveMap, identities: Sequence[Identity]) -> None:
     """Refuse nodes that are not all of the map's family; raises ``ConfigError``, nothing was moved or written."""
     others = [identity for identity in identities if not drive_map.is_for(*identity.vendor_product)]
-    if others and len(identities) > 1 and len({identity.vendor_product for identity in identities}) > 1:
+    if others and len({identity.vendor_product for identity in identities}) > 1:
         families = [(identity, family_of(*identity.vendor_product)) for identity in identities]
         raise ConfigError(
             f"these nodes are drives of several families, and a set is written through one map, here {drive_map.name}",
