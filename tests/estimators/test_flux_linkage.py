@@ -21,6 +21,8 @@ from pmsmtool.estimators.flux.linkage import (
     with_driven,
 )
 from pmsmtool.estimators.flux.linkage_rows import fastest_pair, mean_inverter_error
+from pmsmtool.estimators.injection.sampling_instant import Sampling
+from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
@@ -148,6 +150,21 @@ def test_the_q_currents_are_a_second_method_that_agrees(population: Population) 
         check = cross_check("psi_f_wb_driven", "psi_f_wb", found.driven, found.psi_f, found.voltage_scale_std)
         assert check.agrees, check.verdict
         assert abs(check.difference) < 2e-3
+
+
+def test_samples_of_the_start_show_no_other_instant(population: Population) -> None:
+    """The plant samples at the start of the period and has no ripple, whatever is told of them."""
+    d = population.drives
+    for k in range(2):
+        T_s, curve = float(d.T_s[k]), InverterCurve(*curve_points(d, k), 0.0)
+        switched = Modulation(float(d.U_dc[k]), (float(d.L_d[k]), float(d.L_q[k])), T_s, 1e-6)
+        for late in (0.0, 0.3):
+            found = estimate_flux_linkage(
+                population.speeds(k), d.R[k], period_s=T_s, inverter=curve, modulation=switched,
+                sampling=Sampling(late * T_s),
+            )  # fmt: skip
+            assert found.shown is not None and abs(found.shown.value_s) < 3.0 * found.shown.std_s  # measured 0.8
+            assert found.psi_measured.value == pytest.approx(d.psi[k], rel=1e-3)  # measured 3e-4, all of it ripple
 
 
 def test_a_disagreement_is_reported(population: Population) -> None:
