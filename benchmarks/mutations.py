@@ -299,20 +299,20 @@ def survives(folder: Path, tests: Sequence[Test], number: int, mutation: Mutatio
     """Make a mutation, run the tests, take it back."""
     path = folder / mutation.path
     text = path.read_text(encoding="utf-8")
-    before = _libraries(folder)
+    before = {library: library.read_bytes() for library in (folder / "pmsmtool/_native").glob("*.so")}
     path.write_text(mutation.of(text), encoding="utf-8")
     try:
-        if path.suffix != ".py" and (not _built(folder) or _libraries(folder) == before):
-            return _libraries(folder) == before
+        if path.suffix != ".py":
+            if not _built(folder):
+                return False
+            if all(library.read_bytes() == compiled for library, compiled in before.items()):
+                return True
         return passes(folder, in_turn(tests, number, mutation))
     finally:
         path.write_text(text, encoding="utf-8")
         if path.suffix != ".py":
-            _built(folder)
-
-
-def _libraries(folder: Path) -> list[bytes]:
-    return [path.read_bytes() for path in sorted((folder / "pmsmtool/_native").glob("*.so"))]
+            for library, compiled in before.items():
+                library.write_bytes(compiled)
 
 
 class _Watch:
