@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
@@ -220,7 +221,7 @@ def _restore_left(connection: Connection, node_id: int) -> None:
     node = DriveNode(connection, node_id)
     try:
         identity = node.identity()
-        count = restore_lent(node, identity) + restore_left(node, identity)
+        count = restore_lent(node, identity, partial(click.echo, err=True)) + restore_left(node, identity)
     finally:
         node.close()
     if count:

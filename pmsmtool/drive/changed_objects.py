@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 from pmsmtool.bus.busy import is_busy, when_ready
@@ -152,24 +153,35 @@ def any_lent() -> bool:
     return any((user_folder() / FOLDER).glob("*.json"))
 
 
-def restore_lent(node: DriveNode, identity: Identity) -> int:
+def restore_lent(node: DriveNode, identity: Identity, say: Callable[[str], None]) -> int:
     """Bring back what a killed run left changed, where the drive is off and holds it still; return how many objects.
 
-    What the drive refuses stays in the file, for the next command.
+    What the drive refuses stays in the file, for the next command. A damaged file is said, and removed.
     """
     path, count = _path_of(identity), 0
     if path is None or not path.is_file() or not is_safe(node.state()):
         return 0
+    try:
+        lent = {
+            (name, *(int(part, 16) for part in name.split(":", 1))): (bytes.fromhex(old), bytes.fromhex(new))
+            for name, (old, new) in json.loads(read_text(path)).items()
+        }
+    except (ConfigError, ValueError, TypeError, AttributeError):
+        path.unlink()
+        say(
+            f"node {node.node}: the record of what an interrupted run changed in this drive was damaged, and is "
+            f"removed ({path}): its current or speed limit may still be lowered. Reset the drive "
+            f"(`pmsmtool -n {node.node} nmt reset-node`) before anything is stored: what it has stored comes back"
+        )
+        return 0
     refused: dict[str, tuple[str, str]] = {}
-    with contextlib.suppress(ValueError):  # a file that is damaged says nothing
-        for name, (old, new) in reversed(json.loads(read_text(path)).items()):
-            index, sub = (int(part, 16) for part in name.split(":"))
-            try:
-                if old != new and node.sdo.read(index, sub).hex() == new:
-                    node.sdo.download(index, sub, bytes.fromhex(old))
-                    count += 1
-            except SdoAbort:
-                refused[name] = (old, new)
+    for (name, index, sub), (old, new) in reversed(lent.items()):
+        try:
+            if old != new and node.sdo.read(index, sub) == new:
+                node.sdo.download(index, sub, old)
+                count += 1
+        except SdoAbort:
+            refused[name] = (old.hex(), new.hex())
     if refused:
         write_file(path, json.dumps(dict(reversed(refused.items()))))
     else:

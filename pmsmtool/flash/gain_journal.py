@@ -13,7 +13,7 @@ from pathlib import Path
 
 from pmsmtool.drive.drive_node import DriveNode, is_safe, state_text
 from pmsmtool.drive.port import Identity
-from pmsmtool.errors import SafetyRefusal, VerifyMismatch
+from pmsmtool.errors import ConfigError, SafetyRefusal, VerifyMismatch
 from pmsmtool.flash.journal import Entry, JournalFolder, Snapshot, read_snapshot, write_snapshot
 from pmsmtool.resources import user_folder
 
@@ -84,13 +84,22 @@ def restore_left(node: DriveNode, identity: Identity) -> int:
     ------
     SafetyRefusal
         The drive is energised, or an object holds neither the old value nor the one that was written.
+    ConfigError
+        The journal is damaged.
     VerifyMismatch
         An object does not hold its old value again.
     """
     path = path_of(identity)
     if not path.exists():
         return 0
-    snapshot = read_snapshot(path)
+    try:
+        snapshot = read_snapshot(path)
+    except ConfigError as error:
+        raise ConfigError(
+            f"the record of the gains that an interrupted `map learn` changed is damaged: {error.what}",
+            where=str(path),
+            hint="reset the drive: it comes back with the gains it has stored; then delete the file",
+        ) from error  # fmt: skip
     state = node.state()
     if not is_safe(state):
         raise SafetyRefusal(

@@ -387,9 +387,9 @@ def test_what_a_killed_run_left_comes_back_with_the_next_command(
         table.objects[0x60FF, 0] = B.encode(61)  # somebody else wrote it since: it stays
         node.before_write = None
         table.objects[0x6041, 0] = objects.STATUSWORD.encode(0x27)
-        assert restore_lent(node, identity) == 0, "energised"
+        assert restore_lent(node, identity, print) == 0, "energised"
         table.objects[0x6041, 0] = objects.STATUSWORD.encode(0x40)
-        assert restore_lent(node, identity) == (2 if serial else 0)
+        assert restore_lent(node, identity, print) == (2 if serial else 0)
         assert (node.get(A), node.get(B)) == (5.0 if serial else 70.0, 61.0) and not any_lent()
     with node_of({A: 5}, GENERIC) as (_, node):
         changed = changed_of(node)
@@ -407,9 +407,22 @@ def test_what_a_drive_refuses_to_take_back_is_tried_again(tmp_path: Path, monkey
         node.put(B, 60)
         node.before_write = None
         kept = table.objects.pop((0x6071, 0))
-        assert restore_lent(node, LENT) == 1 and node.get(B) == 6.0 and any_lent()
+        assert restore_lent(node, LENT, print) == 1 and node.get(B) == 6.0 and any_lent()
         table.objects[0x6071, 0] = kept
-        assert restore_lent(node, LENT) == 1 and node.get(A) == 5.0 and not any_lent()
+        assert restore_lent(node, LENT, print) == 1 and node.get(A) == 5.0 and not any_lent()
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", '{"6073:00": 5}', '{"6073:00": ["zz", "05"]}', "\xff"])
+def test_a_damaged_record_of_a_killed_run_is_said(text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was dropped without a word, or ended in a traceback, and the lowered limits could have been stored."""
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path))
+    said: list[str] = []
+    with node_of({A: 5, objects.STATUSWORD: 0x40}, GENERIC) as (_, node):
+        changed_of(node)._keep()
+        (record,) = (tmp_path / "lent").glob("*.json")
+        record.write_text(text, encoding="latin-1")
+        assert restore_lent(node, LENT, said.append) == 0 and not any_lent()
+    assert "may still be lowered" in said[0] and "nmt reset-node" in said[0] and str(record) in said[0]
 
 
 def test_what_was_changed_comes_back_in_reverse_and_once() -> None:

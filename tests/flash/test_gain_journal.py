@@ -11,7 +11,7 @@ import pytest
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import STATUSWORD, DriveObject
 from pmsmtool.drive.port import Identity
-from pmsmtool.errors import SafetyRefusal, VerifyMismatch
+from pmsmtool.errors import ConfigError, SafetyRefusal, VerifyMismatch
 from pmsmtool.flash.gain_journal import GainJournal, any_left, path_of, restore_left
 from pmsmtool.flash.journal import Entry, read_snapshot
 from tests.drive.table_drive import TableDrive, node_of
@@ -99,3 +99,12 @@ def test_of_another_drive_nothing_is_taken(rig: tuple[TableDrive, DriveNode, Ide
     journal.begin()
     change(table, journal, GAIN, 210)
     assert restore_left(node, identity) == 0 and any_left() and table.writes == []
+
+
+def test_a_damaged_journal_says_what_to_do(rig: tuple[TableDrive, DriveNode, Identity]) -> None:
+    """It asked for a file of `pmsmtool backup`."""
+    _, node, identity = rig
+    path_of(identity).parent.mkdir(parents=True)
+    path_of(identity).write_text("{", encoding="ascii")
+    with pytest.raises(ConfigError, match="reset the drive"):
+        restore_left(node, identity)
