@@ -299,6 +299,21 @@ def position_units(node: DriveNode) -> float:
     return sign * _fine_enough(node, row.number)
 
 
+def unlike_stated(node: DriveNode) -> list[str]:
+    """Say where the number of a turn that the owner states in a map is not the drive's own; one line, or none."""
+    row = node.map.motion.get("counts_per_turn")
+    try:
+        own = _position_units(node) if row is not None and row.number else 0.0
+    except NotAvailable:
+        return []
+    if row is None or not own or math.isclose(row.number, own, rel_tol=SAME_UNITS):
+        return []
+    return [
+        f"position  {own:.9g} units per turn by the drive's objects (0x608F, 0x6092), which count; {row.number:.9g} by "
+        "the map (counts_per_turn): remove that row, or set the drive with its maker's software"
+    ]
+
+
 def _fine_enough(node: DriveNode, units: float) -> float:
     if not units >= LEAST_UNITS:
         raise NotAvailable(
@@ -392,8 +407,11 @@ def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, floa
 
 
 def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
-    """Return the limits that the drive lacks, or holds far below its rated current, one line each with what to do."""
-    lines = []
+    """Return the limits that the drive lacks, or holds far below its rated current, one line each with what to do.
+
+    A number of a turn that the map states otherwise is one of them.
+    """
+    lines = unlike_stated(node)
     for limit in current_limits(node, rated):
         held = allowed(node, iter((limit,)))
         if held is not None and 0.0 < held[1] < LOW_LIMIT * rated:

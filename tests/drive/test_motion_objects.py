@@ -221,6 +221,15 @@ def test_the_makers_own_units_of_position(row: MotionObject, units: float | None
             assert motion.position_units(node) == pytest.approx(-units if turned else units)
 
 
+@pytest.mark.parametrize(("stated", "said"), [(4000.0, 1), (8192.0, 0), (0.0, 0)])
+def test_a_stated_number_that_the_drive_contradicts_is_named(stated: float, said: int) -> None:
+    """The drive's own was used without a word."""
+    with drive({motion.ENCODER_COUNTS: 8192}, counts_per_turn=MotionObject(number=stated)) as node:
+        lines = motion.unlike_stated(node)
+        assert len(lines) == said and all("8192" in line and "4000" in line and "which count" in line for line in lines)
+        assert motion.position_units(node) == 8192.0
+
+
 def test_limits_in_their_order_and_units() -> None:
     """Of the current: 0x6073, the maker's own, 0x6072; of the speed (rpm): 0x6080, the maker's own."""
     rows = {"current_limit": own(RMS), "speed_limit": own("rad/s", 0x3005, 0)}
