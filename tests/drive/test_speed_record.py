@@ -81,9 +81,7 @@ def test_a_step_behind_the_recorder_begins_when_the_drive_gets_it(
     assert trace.meta["late_s"] == pytest.approx(late_s)
 
 
-def test_a_reference_is_written_in_the_middle_of_its_transfer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The time between a reference and what the loop makes of it is a measured value (``map learn``)."""
-    bus = Bus()
+def stairs_drive(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> SpeedLoopDrive:
     drive = object.__new__(SpeedLoopDrive)
     supervision = SimpleNamespace(check=lambda: None)
     drive.node = SimpleNamespace(node=1, connection=bus, get=bus.transfer, put=bus.transfer, supervision=supervision)  # type: ignore[assignment]
@@ -91,6 +89,25 @@ def test_a_reference_is_written_in_the_middle_of_its_transfer(monkeypatch: pytes
     drive.counts_per_turn, drive._polled = 4000.0, ()
     drive._current = SimpleNamespace(item=object(), per_count=0.1)  # type: ignore[assignment]
     monkeypatch.setattr(SpeedLoopDrive, "check_operating", lambda self: None)
+    return drive
+
+
+def test_a_bus_too_slow_for_every_step_leaves_steps_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The staircase is over when it was planned to be: what is fitted are its ways up."""
+    bus = Bus()
+    drive = stairs_drive(bus, monkeypatch)
+    drive.period_s, speeds = 0.7 * TRANSFER_S, [10.0 + k for k in range(40)]
+    stairs = Excitation(Shape.BUFFER, Injection.SPEED, 0.0, hold_periods=1, buffer=speeds)
+    drive.begin_record(Recording((), 0, excitation=stairs), bus.wait)
+    drive.wait(40.0 * drive.period_s)
+    steps = drive.finish_record(Recording((), 0)).meta["steps"]
+    assert 2 < len(steps) < 40 and steps[-1][1] == speeds[-1]
+
+
+def test_a_reference_is_written_in_the_middle_of_its_transfer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The time between a reference and what the loop makes of it is a measured value (``map learn``)."""
+    bus = Bus()
+    drive = stairs_drive(bus, monkeypatch)
     stairs = Excitation(Shape.BUFFER, Injection.SPEED, 0.0, hold_periods=5, buffer=(20.0, 20.0, 30.2))
     recording = Recording((), 0, excitation=stairs)
 
