@@ -44,7 +44,7 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.measurement.learn_gains import GAIN, INTEGRAL, gain_object, learn_speed_loop, within_budget
 from pmsmtool.measurement.learn_position_gain import learn_position_gain, position_gain
-from pmsmtool.measurement.learned_rows import learned_gains, shown_currents
+from pmsmtool.measurement.learned_rows import emf_of, learned_gains, shown_currents
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.units import rad_s_from_rpm
@@ -196,7 +196,7 @@ def _learn(
     if kill_at:
         GuardedDrive.change = cut  # type: ignore[method-assign]
     try:
-        measured = learn_speed_loop(drive, gain, integral, envelope, lambda text: None)
+        measured = learn_speed_loop(drive, gain, integral, envelope, emf_of(told), lambda text: None)
     finally:
         GuardedDrive.change = change  # type: ignore[method-assign]
         result.over_speed = largest > OVER * speed_max

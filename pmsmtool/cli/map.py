@@ -66,6 +66,7 @@ def learn_command(
     checked. Exit code 0: everything decided; 1: a published scale is contradicted; 6: nothing decided; 10: some.
     """
     from pmsmtool.cli.consent import ask_motion
+    from pmsmtool.drive.motion_objects import unlike_stated
     from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.map_gate import check_motion
@@ -80,7 +81,7 @@ def learn_command(
         refuse_unsafe,
     )
     from pmsmtool.measurement.learn_position_gain import POSITION, learn_position_gain, position_gain
-    from pmsmtool.measurement.learned_rows import learned_gains
+    from pmsmtool.measurement.learned_rows import emf_of, learned_gains
 
     asked = _addresses(names)
     file = load_machine_file(machine_path)
@@ -106,14 +107,15 @@ def learn_command(
         refuse_unsafe(node, envelope)
         lines = [
             *envelope.lines(),
-            "the shaft turns at half of the speed limit and takes steps, with the drive's own speed loop",
+            *unlike_stated(node),
+            "the shaft turns at up to 70 % of the speed limit and takes steps, with the drive's own speed loop",
             *(["then it moves by three turns and back, twice, with its position loop"] if POSITION in found else []),
-            *(f"{gain.name} in {gain.address} holds {gain.counts}: it is changed while the voltage is off, and restored"
-              for gain in found.values()),
+            *(f"{gain.name} in {gain.address} holds {gain.counts:.9g}: it is changed while the voltage is off, and "
+              "restored" for gain in found.values()),
             "nothing is stored in the drive; every changed object is restored",
         ]  # fmt: skip
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
-        measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, out.note)
+        measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, emf_of(file), out.note)
         results = learned_gains(file, measured)
         if POSITION in found:
             results[POSITION] = learn_position_gain(connection, node, found[POSITION], envelope, out.note)

@@ -16,17 +16,22 @@ from pmsmtool.identification.speed_loop_response import SpeedLoop
 NORMAL_95 = 1.96
 WIDEST = 0.12
 """Half width (95 %, relative) of a scale beyond which it stays unknown: 12 % of a gain is 1 dB."""
-MODEL_DOUBT = (0.03, 0.05)
+MODEL_DOUBT = (0.02, 0.03)
 """What the loop's model leaves of K_p and of K_i (standard deviation, relative): unknown filters, dead time, friction.
-Measured errors of K_p on 9 random drives: -14 to +6 % (docs/learned-gains.md)."""
-CURRENT_BANDWIDTH_RAD_S, BANDWIDTH_DOUBT = 2000.0, 0.6
-"""What a maker's current loop has, about; the standard deviation of what follows from it (relative): 600 to 6000."""
-CHANGE_DOUBT = (0.04, 0.07, 0.07)
+Measured on random drives whose EMF takes little: 0 to 3 % and 0 to 2 % (docs/learned-gains.md)."""
+SMALL_CURRENT = 0.006
+"""Standard deviation of a gain (relative) times current over rated current: below some percent of the rated current the
+inverter's dead time holds the current back. Measured at 7 % of it: K_p -20 %."""
+CURRENT_BANDWIDTH, BANDWIDTH_DOUBT = 0.12, 0.7
+"""What a maker's current loop has (rad/s) over its switching frequency (Hz), about: 0.05 to 0.3; the standard deviation
+of what follows from it (relative)."""
+CHANGE_DOUBT = (0.03, 0.05, 0.04)
 """What it leaves of a ratio of two K_p, K_i or K_i / K_p of one drive (standard deviation, relative)."""
 SPREAD_DOUBT = 0.5
 """Of what a scale differs between the drive's own and changed gains (standard deviation, relative)."""
 LEFT_DOUBT = 0.5
-"""Of what steps of two sizes say about steps without end (standard deviation, relative)."""
+"""Of what steps of half the size say otherwise: friction and dead time are a larger share of them (standard deviation,
+relative)."""
 FITS = 14.2
 """Largest chi-square of a hypothesis that explains three ratios (3 degrees of freedom, 3 sigma)."""
 APART = 16.0
@@ -65,34 +70,44 @@ class Rotor:
     time_constant_s : float
         J R / (K_T K_E): without feed-forward of the EMF a current loop of bandwidth w lags an acceleration as if the
         inertia were larger by 1 / (w tau).
+    f_s_hz : float
+        Switching frequency, which bounds the bandwidth.
     """
 
     J_kgm2: float
     J_std: float
     time_constant_s: float
+    f_s_hz: float
 
     @property
     def lagging(self) -> float:
-        """By how much a gain seems smaller, for its current lags the EMF (relative)."""
-        return 1.0 / (CURRENT_BANDWIDTH_RAD_S * self.time_constant_s)
+        """By how much the inertia seems larger, for the current lags the EMF (relative)."""
+        return 1.0 / (CURRENT_BANDWIDTH * self.f_s_hz * self.time_constant_s)
 
-    def gain_per_rad_s(self, K_per_J: float) -> float:
-        """Return a gain from its share of the inertia."""
-        return self.J_kgm2 * K_per_J * (1.0 + self.lagging)
+    @property
+    def lag_std(self) -> float:
+        """Standard deviation of what that leaves of a gain (relative)."""
+        return BANDWIDTH_DOUBT * self.lagging
 
     @property
     def std(self) -> float:
-        """Standard deviation of that (relative)."""
-        return math.hypot(self.J_std, BANDWIDTH_DOUBT * self.lagging)
+        """Standard deviation of a gain that is known by its share of the inertia (relative)."""
+        return math.hypot(self.J_std, self.lag_std)
 
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One measured loop, and the counts that both gains held meanwhile."""
+    """One measured loop, the counts that both gains held meanwhile, and the largest current over the rated one."""
 
-    gain: int
-    integral: int
+    gain: float
+    integral: float
     loop: SpeedLoop
+    current_share: float = 1.0
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of what a small current leaves of a gain (relative)."""
+        return SMALL_CURRENT / self.current_share
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,15 +165,10 @@ def _change(after: Observation, base: Sequence[Observation], which: int) -> tupl
     return _log(after, which) - _log(base[0], which), CHANGE_DOUBT[which]
 
 
-def _at_large_steps(logs: Sequence[float], half_size: float) -> tuple[float, float]:
-    """Return the first logarithm as steps without end would give it, and its standard deviation.
-
-    Friction and the inverter's dead time are a share of a step that is twice as large at half its size: what the first
-    of the logarithms differs from the one at half the size is left of it, and half of that is doubted.
-    """
-    _, spread = _mean(logs)
-    left = logs[0] - half_size
-    return logs[0] + left, math.hypot(SPREAD_DOUBT * spread, LEFT_DOUBT * left)
+def _of_all(logs: Sequence[float], half_size: float) -> tuple[float, float]:
+    """Return the mean of logarithms, and its standard deviation with what steps of half the size differ from them."""
+    mean, spread = _mean(logs)
+    return mean, math.hypot(SPREAD_DOUBT * spread, LEFT_DOUBT * (mean - half_size))
 
 
 def _mean(logs: Sequence[float]) -> tuple[float, float]:
@@ -189,9 +199,9 @@ def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, ro
         why = f"the response follows the counts with the exponent {change / asked:.2f}, not 1"
         return Learned(name, None, math.inf, None, "", why)
     logs = [_log(o, K_P) - math.log(o.gain) for o in (base[0], gain_changed, base[1])]
-    mean, std = _at_large_steps(logs[:-1], logs[-1])
-    std = math.hypot(std, MODEL_DOUBT[0], rotor.std)
-    scale, half = rotor.gain_per_rad_s(math.exp(mean)), NORMAL_95 * std
+    mean, std = _of_all(logs[:-1], logs[-1])
+    std = math.hypot(std, MODEL_DOUBT[0], base[0].std, rotor.std)
+    scale, half = rotor.J_kgm2 * math.exp(mean), NORMAL_95 * std
     if half > WIDEST:
         return Learned(name, None, half, "value", UNITS["gain"], f"its interval of {100 * half:.0f} % is too wide")
     return Learned(name, scale, half, "value", UNITS["gain"])
@@ -238,11 +248,11 @@ def integral_scale(
     for o in observed:
         kept = _log(o, RATE if relative else K_I)
         logs.append((-kept if best == "time" else kept) - math.log(o.integral))
-    mean, std = _at_large_steps(logs[:-1], logs[-1])
-    half = NORMAL_95 * math.hypot(std, MODEL_DOUBT[1], 0.0 if relative else rotor.std)
+    mean, std = _of_all(logs[:-1], logs[-1])
+    half = NORMAL_95 * math.hypot(std, MODEL_DOUBT[1], base[0].std, rotor.lag_std if relative else rotor.std)
     if half > WIDEST:
         return unknown(f"its interval of {100 * half:.0f} % is too wide", best, half)
-    scale = math.exp(mean) if relative else rotor.gain_per_rad_s(math.exp(mean))
+    scale = math.exp(mean) if relative else rotor.J_kgm2 * math.exp(mean)
     return Learned(name, scale, half, best, UNITS[best], "", chi_squares)
 
 

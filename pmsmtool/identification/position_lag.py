@@ -145,7 +145,7 @@ def _integral(t: Array, x: Array) -> Array:
 
 
 def position_scale(
-    own: tuple[int, PositionLag], changed: tuple[int, PositionLag], name: str, *, forward_is_zero: bool = False
+    own: tuple[float, PositionLag], changed: tuple[float, PositionLag], name: str, *, forward_is_zero: bool = False
 ) -> Learned:
     """Return what one count of the position gain is worth (1/s), from its counts and lags before and after a change.
 

@@ -22,11 +22,12 @@ from pmsmtool.drive.motion_objects import allowed, speed_limits
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
+from pmsmtool.drive_maps.drive_map import LETTERS
 from pmsmtool.errors import IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal, SdoAbort
 from pmsmtool.flash.gain_journal import GainJournal
 from pmsmtool.flash.journal import Entry
 from pmsmtool.identification.learned_gains import Observation
-from pmsmtool.identification.speed_loop_response import SpeedLoop, StepRecord, fit_speed_loop, phase_margin_rad
+from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop, StepRecord, fit_speed_loop, phase_margin_rad
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Brake, Load, MachineParameters, Shaft
 from pmsmtool.measurement.speed_unit import find_speed_unit
@@ -40,31 +41,40 @@ HOLDS = re.compile(r" (?:has|holds) ")
 """Reasons why a map leaves a gain out begin with its objects: "0x2331:01 or 0x60F9:01 has no unit ..."."""
 DOWN = 0.7
 """First change of a gain."""
-INTEGRAL_DOWN = 0.8
-"""First change of an integral part: where it is a time, its gain rises by 1.25."""
+INTEGRAL_DOWN, LITTLE_DOWN = 0.8, 0.9
+"""First change of an integral part: where it is a time, its gain rises by 1.25, less where the margin needs it."""
 FURTHER_DOWN = 0.5
 """Second change of an integral part, towards the smaller gain."""
 SURE = 0.4
 """Share of the first change that must be seen before the second: noise and friction leave a fifth."""
-MOST_UP = 1.25
 LEAST_MARGIN_RAD, LEAST_MARGIN_DOWN_RAD = math.radians(40.0), math.radians(30.0)
 """Predicted phase margin below which nothing is changed: where a gain may rise, and where it can only fall."""
 TRIP = 3.0
 """Oscillation over the one with the drive's own gains, at which the voltage is removed."""
-AIM_SHARE = 0.5
-"""Speed about which the steps are taken, of the speed limit."""
+LOW_SHARE, HIGH_SHARE = 0.15, 0.7
+"""Speeds between which the reference climbs and falls, of the speed limit."""
 STEP_CURRENT = 0.5
 """Current of a step, of what drive and envelope allow: large against friction and the inverter's dead time."""
-FIRST_STEP, MOST_STEP = 0.03, 0.35
-"""Steps of speed, of the speed about which they are taken."""
+FIRST_STEP = 0.02
+"""First step of speed, of the speeds between which it climbs."""
 GROWN, ENOUGH, TRIES = 4.0, 0.75, 6
-HOLD_S = 0.05
-"""Steps are held for multiples of this time."""
-INTEGRAL_S, LONGEST = 0.1, 2.5
-"""Time of the integral (K_p / K_i) for which these holds are long enough; by how much they grow with it at most."""
-SETTLE_S = 0.8
-PATTERN = (*(0,) * 8, *(1,) * 8, *(0,) * 6, *(1,) * 4, *(0,) * 8, *(1,) * 6, *(0,) * 6)
-"""Two levels of speed, held for 0.2 to 0.4 s: a loop of 25 to 200 rad/s and an integral of 2 to 40 rad/s."""
+CLIMB, RETURN = 0.3, 0.6
+"""Acceleration of the reference up and back, of what a step begins with: on the way up the current keeps its sign, for
+after a step it swings back by up to a fifth of its peak, and through zero the inverter's dead time would delay it."""
+STEPS = (2, 6)
+"""Steps of one way up, at least and at most."""
+TICK_S = 5e-3
+"""Time between the small steps that make a climb."""
+FIRST_BANDWIDTH = 50.0
+"""K_p / J that the first steps are made for (1/s)."""
+HOLD_SHARES = (1.0, 0.6)
+HOLD_S, HOLD_TIMES, HOLD_INTEGRAL = (0.04, 0.3), 5.0, 1.5
+"""How long a step is held: these many times the time constants of loop and integral; less in every other way."""
+SETTLE_S, REST_AT_LOW_S, LEAST_S = 0.8, 0.4, 2.4
+SETTLE_TIMES, LONGEST_S = 8.0, 4.0
+"""Time constants of the integral for which the first speed is held, and at most how long; half of them at half gain."""
+LEAST_AT_REST = 40
+"""Samples before the first step that the noise is read from."""
 SPEED_SHARE = 0.4
 """Speed limit where none is asked for, of the largest speed of the machine: no field weakening."""
 DURATION_S = 120.0
@@ -74,6 +84,8 @@ REST_S, REST_RAD = 0.3, 2e-3
 COARSEST = 0.12
 """Largest deviation of a ratio in whole counts from the one wanted."""
 ROUNDING = 1.0 / math.sqrt(12.0)
+FLOATS_FROM = 0x20000000
+"""Whole number from which four bytes of unknown type are rather a REAL32: 0.7 of its bits would be another gain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +94,7 @@ class GainObject:
 
     name: str
     item: DriveObject
-    counts: int
+    counts: float
 
     @property
     def address(self) -> str:
@@ -128,15 +140,16 @@ def named_addresses(node: DriveNode, name: str) -> list[tuple[int, int]]:
     return [(int(index, 16), int(sub, 16)) for index, sub in places]
 
 
-def gain_object(node: DriveNode, name: str, index: int, sub: int, wire: str | None = None) -> GainObject:
-    """Return the object of a gain, its type by its size where no map says it.
+def gain_object(node: DriveNode, name: str, index: int, sub: int) -> GainObject:
+    """Return the object of a gain, its type by the map, else by its size.
 
     Raises
     ------
     NotAvailable
-        The drive has no such object, or it is no whole number of up to 32 bits, or too small to be changed by a known
-        ratio.
+        The drive has no such object, or its type is not known, or it is too small to be changed by a known ratio.
     """
+    cell = node.map.cells.get(name)
+    wire = LETTERS[cell.wire] if cell is not None and (cell.index, cell.sub) == (index, sub) else None
     where = f"node {node.node}, 0x{index:04X}:{sub:02X}"
     try:
         data = node.sdo.read(index, sub)
@@ -148,29 +161,39 @@ def gain_object(node: DriveNode, name: str, index: int, sub: int, wire: str | No
             hint=f"name the one that its manual calls this gain: `pmsmtool map learn {name}=0xINDEX:SUB`",
         ) from abort  # fmt: skip
     letter = wire or {1: "B", 2: "H", 4: "I"}.get(len(data), "")
-    if not letter or letter == "f" or DriveObject(index, sub, letter).size != len(data):
-        raise NotAvailable(f"{name}: {len(data)} bytes are no whole number that this program changes", where=where)
+    if not letter or DriveObject(index, sub, letter).size != len(data):
+        raise NotAvailable(f"{name}: {len(data)} bytes are no number that this program changes", where=where)
     item = DriveObject(index, sub, letter)
-    found = GainObject(name, item, int(item.decode(data)))
+    held = item.decode(data)
+    if wire is None and held >= FLOATS_FROM:
+        raise NotAvailable(
+            f"{name}: its bytes {data.hex()} may be a whole number or a REAL32", where=where,
+            hint="give the object with its type in a map: --map FILE",
+        )  # fmt: skip
+    found = GainObject(name, item, held)
     changed_counts(found, DOWN)
     return found
 
 
-def changed_counts(gain: GainObject, ratio: float) -> int:
-    """Return counts in about a ratio to those held.
+def changed_counts(gain: GainObject, ratio: float) -> float:
+    """Return counts in about a ratio to those held: whole ones, but of a REAL32.
 
     Raises
     ------
     NotAvailable
-        Whole counts are too coarse for it.
+        Whole counts are too coarse for it, or it holds no gain.
     """
-    counts = round(gain.counts * ratio)
-    signed = (1 << 8 * gain.item.size - 1) - 1
-    if gain.counts <= signed:  # nothing says whether the object has a sign
-        counts = min(counts, signed)
-    if gain.counts <= 0 or not 1.0 - COARSEST < counts / (gain.counts * ratio) < 1.0 + COARSEST:
+    counts = gain.counts * ratio
+    if gain.item.letter == "f":
+        counts = gain.item.decode(gain.item.encode(counts))
+    else:
+        signed = (1 << 8 * gain.item.size - 1) - 1
+        counts = round(counts)
+        if gain.counts <= signed:  # nothing says whether the object has a sign
+            counts = min(counts, signed)
+    if not 0.0 < gain.counts < math.inf or not 1.0 - COARSEST < counts / (gain.counts * ratio) < 1.0 + COARSEST:
         raise NotAvailable(
-            f"{gain.name} holds {gain.counts}: too few counts to change it by {ratio:g}", where=gain.address
+            f"{gain.name} holds {gain.counts:.9g}: it cannot be changed by {ratio:g}", where=gain.address
         )
     return counts
 
@@ -207,7 +230,7 @@ def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: 
     acceleration = largest_acceleration(machine, i_max_apk)
     if allowed(drive.node, speed_limits(drive.node)) is not None or acceleration is None:
         return i_max_apk
-    room = (1.0 - AIM_SHARE * (1.0 + MOST_STEP)) * speed_max_rad_s
+    room = (1.0 - HIGH_SHARE) * speed_max_rad_s
     return i_max_apk * min(1.0, room / (acceleration * SEEN_S))
 
 
@@ -246,6 +269,7 @@ def learn_speed_loop(
     gain: GainObject,
     integral: GainObject,
     envelope: Envelope,
+    emf: Emf,
     say: Callable[[str], None],
 ) -> LearnedLoop:
     """Measure the speed loop with the drive's own gains and with each changed; the drive is as before on return.
@@ -267,7 +291,7 @@ def learn_speed_loop(
         with guarded(drive, envelope, say=say) as guard:
             drive.send_samples()
             try:
-                found = _Learner(guard, drive, journal, say).run(gain, integral)
+                found = _Learner(guard, drive, journal, emf, say).run(gain, integral)
             finally:
                 guard.stop()
                 drive.end_samples()
@@ -279,17 +303,47 @@ def learn_speed_loop(
     return found
 
 
-def _smaller(own: SpeedLoop, changed: SpeedLoop) -> float | None:
+def _margin(own: SpeedLoop, worst: tuple[float, float]) -> float:
+    """Return the least phase margin (rad) where K_p and K_i may have changed by these ratios, whatever the form."""
+    a, b, lag_s = own.K_p_per_J, own.K_i_per_J, own.lag_s
+    return min(phase_margin_rad(a * p, b * i, lag_s) for p in (1.0, worst[0]) for i in (1.0, worst[0], worst[1]))
+
+
+def _smaller(own: SpeedLoop, changed: SpeedLoop, ratio: float) -> float | None:
     """Return in which ratio counts must change to make K_i smaller; None where that is not sure.
 
     K_i / K_p must show it, for the fit tells K_i and K_p apart least; K_i must not show the contrary.
     """
-    sure = SURE * abs(math.log(INTEGRAL_DOWN))
+    sure = SURE * abs(math.log(ratio))
     K_i = math.log(changed.K_i_per_J / own.K_i_per_J)
     relative = K_i - math.log(changed.K_p_per_J / own.K_p_per_J)
     if relative < -sure and K_i < 0.5 * sure:
         return FURTHER_DOWN
     return 1.0 / FURTHER_DOWN if relative > sure and K_i > -0.5 * sure else None
+
+
+def staircase(
+    low: float, step: float, number: int, bandwidth: float, hold_s: float
+) -> tuple[list[float], list[tuple[float, float]]]:
+    """Return speeds (rad/s), one per tick, that rise from ``low`` by steps on a ramp, and when the ways up are (s).
+
+    Parameters
+    ----------
+    bandwidth : float
+        K_p / J of the loop (1/s).
+    """
+    tick = step * bandwidth * TICK_S
+    speeds = [low] * round(REST_AT_LOW_S / TICK_S)
+    ways: list[tuple[float, float]] = []
+    while len(speeds) * TICK_S < LEAST_S:
+        ticks = max(1, round(HOLD_SHARES[len(ways) % 2] * hold_s / TICK_S))
+        begin = len(speeds) - 1
+        speeds += [low + step * (k // ticks + 1) + CLIMB * tick * (k + 1) for k in range(number * ticks)]
+        ways.append((TICK_S * begin, TICK_S * len(speeds)))
+        while speeds[-1] > low:
+            speeds.append(max(low, speeds[-1] - RETURN * tick))
+        speeds += [low] * ticks
+    return speeds, ways
 
 
 class _Learner:
@@ -300,89 +354,112 @@ class _Learner:
         guard: GuardedDrive,
         drive: SpeedLoopDrive,
         journal: GainJournal,
+        emf: Emf,
         say: Callable[[str], None],
     ) -> None:
-        self.guard, self.drive, self.journal, self.say = guard, drive, journal, say
-        self.aim = AIM_SHARE * guard.envelope.speed_max_rad_s
-        self.hold_s = HOLD_S
+        self.guard, self.drive, self.journal, self.emf, self.say = guard, drive, journal, emf, say
+        limit = guard.envelope.speed_max_rad_s
+        self.low, self.span = LOW_SHARE * limit, (HIGH_SHARE - LOW_SHARE) * limit
+        self.bandwidth, self.hold_s, self.settle_s = FIRST_BANDWIDTH, HOLD_TIMES / FIRST_BANDWIDTH, SETTLE_S
         self.notes: list[str] = []
 
     def run(self, gain: GainObject, integral: GainObject) -> LearnedLoop:
         """Measure everything."""
         guard, drive = self.guard, self.drive
         guard.enable()
-        unit = find_speed_unit(guard, drive, self.aim)
-        self.say(f"one count of 0x60FF is {unit:.5g} rad/s; the steps are taken about {self.aim:.4g} rad/s")
-        step = self._size()
+        unit = find_speed_unit(guard, drive, 0.5 * guard.envelope.speed_max_rad_s)
+        self.say(
+            f"one count of 0x60FF is {unit:.5g} rad/s; the steps are taken between {self.low:.4g} and "
+            f"{self.low + self.span:.4g} rad/s"
+        )
         counts = {GAIN: gain.counts, INTEGRAL: integral.counts}
-        own = self._observe("with the drive's own gains", step, counts)
-        slow = own.loop.K_p_per_J / own.loop.K_i_per_J / INTEGRAL_S
-        if slow > 1.0:  # a slow integral needs longer steps
-            self.hold_s = HOLD_S * min(slow, LONGEST)
-            own = self._observe(f"with steps {min(slow, LONGEST):.2g} times as long", step, counts, own.loop)
+        own = self._observe("with the drive's own gains", self._size(), counts)
+        self.bandwidth = own.loop.K_p_per_J
+        integral_s = self.bandwidth / own.loop.K_i_per_J
+        self.settle_s = min(max(SETTLE_S, SETTLE_TIMES * integral_s), LONGEST_S)
+        wanted_s = max(HOLD_TIMES / self.bandwidth, HOLD_INTEGRAL * integral_s)
+        self.hold_s = min(max(wanted_s, HOLD_S[0]), HOLD_S[1])
+        step = self._size()
+        own = self._observe(f"with steps held for {1e3 * self.hold_s:.0f} ms", step, counts, own.loop)
         drive.oscillation.limit_a = TRIP * max(drive.oscillation.largest_a, drive.current_count_a)
-        half = self._observe("with steps of half the size", 0.5 * step, counts, own.loop)
+        half = self._observe("with steps of half the size", 0.5 * step, counts, own.loop, own.loop.lag_s)
         gain_changed = self._changed(gain, DOWN, own.loop, (DOWN, DOWN), step, counts)
-        integral_changed = [self._changed(integral, INTEGRAL_DOWN, own.loop, (1.0, MOST_UP), step, counts)]
-        further = None if integral_changed[0] is None else _smaller(own.loop, integral_changed[0].loop)
+        little = _margin(own.loop, (1.0, 1.0 / INTEGRAL_DOWN)) < LEAST_MARGIN_RAD
+        ratio = LITTLE_DOWN if little else INTEGRAL_DOWN
+        integral_changed = [self._changed(integral, ratio, own.loop, (1.0, 1.0 / ratio), step, counts)]
+        further = None if integral_changed[0] is None else _smaller(own.loop, integral_changed[0].loop, ratio)
         if further is not None:
             integral_changed.append(self._changed(integral, further, own.loop, (1.0, FURTHER_DOWN), step, counts))
         found = [observation for observation in integral_changed if observation is not None]
         return LearnedLoop((own, half), gain_changed, found, unit, self.notes)
 
+    @property
+    def risen(self) -> float:
+        """By how many steps the reference rises in the longest hold, with the step itself."""
+        return 1.0 + CLIMB * self.bandwidth * self.hold_s
+
     def _size(self) -> float:
         """Return the step of speed whose current is large against friction and small against every limit."""
         drive, guard = self.drive, self.guard
         wanted = STEP_CURRENT * min(guard.envelope.i_max_apk, drive.current_limit_apk, drive.rated_apk)
-        step = FIRST_STEP * self.aim
+        most = self.span / (STEPS[0] * self.risen)
+        step = min(FIRST_STEP * self.span, most)
         for _ in range(TRIES):
-            record = self._record(step, PATTERN[:14])
+            record = self._record(step, most_steps=STEPS[0])
             shown = np.abs(record.current_a - np.median(record.current_a[record.t_s < record.references[1][0]]))
             ratio = wanted / max(float(shown.max()), drive.current_count_a)
             if ENOUGH < ratio < 1.0 / ENOUGH:
                 break
-            grown = min(step * min(ratio, GROWN), MOST_STEP * self.aim)
+            grown = min(step * min(ratio, GROWN), most)
             if grown == step:
                 break
             step = grown
         return step
 
-    def _record(self, step: float, pattern: Sequence[int]) -> StepRecord:
+    def _record(self, step: float, most_steps: int = STEPS[1]) -> StepRecord:
         guard, drive = self.guard, self.drive
-        guard.command_speed(self.aim)
-        guard.wait(SETTLE_S)
-        hold = round(self.hold_s / drive.period_s)
-        excitation = Excitation(
-            Shape.BUFFER, Injection.SPEED, 0.0, hold_periods=hold, buffer=[self.aim + step * level for level in pattern]
-        )
-        trace = guard.record(("theta_m_rad", "i_q_a"), hold * len(pattern), excitation=excitation)
+        guard.command_speed(self.low)
+        guard.wait(self.settle_s)
+        number = min(most_steps, max(STEPS[0], int(self.span / (step * self.risen))))
+        speeds, ways = staircase(self.low, step, number, self.bandwidth, self.hold_s)
+        hold = round(TICK_S / drive.period_s)
+        excitation = Excitation(Shape.BUFFER, Injection.SPEED, 0.0, hold_periods=hold, buffer=speeds)
+        trace = guard.record(("theta_m_rad", "i_q_a"), hold * len(speeds), excitation=excitation)
         t, position, current = trace.t_s, trace["theta_m_rad"], trace["i_q_a"]
         references = [(float(at), float(value)) for at, value in trace.meta["steps"]]
         still = t < references[1][0]
-        if np.count_nonzero(still) < len(pattern):
+        if np.count_nonzero(still) < LEAST_AT_REST:
             raise IdentificationError(
                 "E_EXCITATION", "too few samples of the steps",
                 likely="the bus is busy", hint="leave the bus to this program, then run the command again",
             )  # fmt: skip
-        line = np.polyval(np.polyfit(t[still], position[still], 1), t[still])
+        speed, at = np.polyfit(t[still], position[still], 1)
+        unit = float(speed) / references[0][1]  # the integral leaves no error: this is the speed that was asked for
+        references = [(when, unit * value) for when, value in references]
         count = 2.0 * math.pi / abs(drive.counts_per_turn)
-        noise_rad = math.hypot(float(np.std(position[still] - line)), ROUNDING * count)
+        noise_rad = math.hypot(float(np.std(position[still] - speed * t[still] - at)), ROUNDING * count)
         noise_a = math.hypot(float(np.std(current[still])), ROUNDING * drive.current_count_a)
-        return StepRecord(t, position, current, references, [(HOLD_S, float(t[-1]))], noise_rad, noise_a)
+        return StepRecord(t, position, current, references, ways, noise_rad, noise_a)
 
     def _observe(
-        self, what: str, step: float, counts: Mapping[str, int], first: SpeedLoop | None = None
+        self,
+        what: str,
+        step: float,
+        counts: Mapping[str, float],
+        first: SpeedLoop | None = None,
+        lag_s: float | None = None,
     ) -> Observation:
-        record = self._record(step, PATTERN)
+        record = self._record(step)
         self.guard.stop()  # a fit takes longer than the drive waits for a heartbeat
-        loop = fit_speed_loop(record, first)
+        loop = fit_speed_loop(record, self.emf, first, lag_s)
         margin = math.degrees(phase_margin_rad(loop.K_p_per_J, loop.K_i_per_J, loop.lag_s))
         self.say(
             f"{what}: K_p/J {loop.K_p_per_J:.4g} 1/s, K_i/K_p {loop.K_i_per_J / loop.K_p_per_J:.3g} 1/s, "
             f"phase margin about {margin:.0f} deg"
         )
         self.guard.enable()
-        return Observation(counts[GAIN], counts[INTEGRAL], loop)
+        peak = float(np.abs(record.current_a).max())
+        return Observation(counts[GAIN], counts[INTEGRAL], loop, peak / self.drive.rated_apk)
 
     def _changed(
         self,
@@ -391,7 +468,7 @@ class _Learner:
         own: SpeedLoop,
         worst: tuple[float, float],
         step: float,
-        counts: Mapping[str, int],
+        counts: Mapping[str, float],
     ) -> Observation | None:
         """Change one gain while the voltage is off, measure, and bring it back; None where it must not be changed.
 
@@ -402,8 +479,7 @@ class _Learner:
         except NotAvailable as error:
             self.notes.append(f"{gain.name}: {error.what}")
             return None
-        a, b, lag_s = own.K_p_per_J, own.K_i_per_J, own.lag_s
-        margin = min(phase_margin_rad(a * p, b * i, lag_s) for p in (1.0, worst[0]) for i in (1.0, worst[0], worst[1]))
+        margin = _margin(own, worst)
         least = LEAST_MARGIN_RAD if max(worst) > 1.0 else LEAST_MARGIN_DOWN_RAD
         if margin < least:
             self.notes.append(
@@ -414,20 +490,21 @@ class _Learner:
         try:
             self._put(gain, new)
         except SdoAbort as abort:
-            self.notes.append(f"{gain.name}: the drive does not take {new}: {abort.what}")
+            self.notes.append(f"{gain.name}: the drive does not take {new:.9g}: {abort.what}")
             self.guard.enable()
             return None
         self.guard.enable()
         found = None
         try:
-            found = self._observe(f"{gain.address} {gain.counts} -> {new}", step, {**counts, gain.name: new}, own)
+            what = f"{gain.address} {gain.counts:.9g} -> {new:.9g}"
+            found = self._observe(what, step, {**counts, gain.name: new}, own, own.lag_s)
         except IdentificationError as error:
             self.notes.append(f"{gain.name}: {error.what}")
         self._put(gain, gain.counts)  # after anything else the guard does it, and nothing is enabled again
         self.guard.enable()
         return found
 
-    def _put(self, gain: GainObject, counts: int) -> None:
+    def _put(self, gain: GainObject, counts: float) -> None:
         data = gain.item.encode(counts)
         self.guard.stop()
         self.journal.note(gain.item.index, gain.item.sub, data)

@@ -89,7 +89,7 @@ def _moved(drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Call
     try:
         with guarded(drive, replace(envelope, travel_rad=TRAVEL * WAY_RAD), say=say) as guard:
 
-            def put(item: GainObject, counts: int) -> None:
+            def put(item: GainObject, counts: float) -> None:
                 data = item.item.encode(counts)
                 journal.note(item.item.index, item.item.sub, data)
                 guard.change(item.item, data)
@@ -97,13 +97,13 @@ def _moved(drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Call
             if forward is not None:
                 put(forward, 0)
             record_move(guard, drive, SHORT_RAD, REST_S, find=(SPEED_RAD_S, SPEED_RAD_S / RAMP_S))
-            lags: list[tuple[int, PositionLag]] = []
+            lags: list[tuple[float, PositionLag]] = []
             for counts in (gain.counts, changed_counts(gain, DOWN)):
                 if lags:
                     put(gain, counts)
                 trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
                 lags.append((counts, position_lag(trace, drive.rad_per_count)))
-                say(f"{gain.address} = {counts}: speed over lag {lags[-1][1].gain_per_s:.4g} 1/s")
+                say(f"{gain.address} = {counts:.9g}: speed over lag {lags[-1][1].gain_per_s:.4g} 1/s")
             for item in written:
                 put(item, item.counts)
     except PmsmtoolError:

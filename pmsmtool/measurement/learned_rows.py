@@ -10,6 +10,7 @@ from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map import LETTERS, DriveMap
 from pmsmtool.drive_maps.measured_rows import MeasuredRow, with_measured
 from pmsmtool.identification.learned_gains import Convention, Learned, Rotor, convention, gain_scale, integral_scale
+from pmsmtool.identification.speed_loop_response import Emf
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.measurement.learn_gains import GAIN, INTEGRAL, GainObject, LearnedLoop
@@ -33,7 +34,12 @@ def rotor_of(file: MachineFile) -> Rotor:
     J = float(machine.J_kgm2 or 0.0)
     EMF_per_rad_s = machine.pole_pairs * machine.psi_f_wb
     tau_s = J * machine.R_s_ohm / (torque_per_ampere(machine.pole_pairs, machine.psi_f_wb) * EMF_per_rad_s)
-    return Rotor(J, _relative(file, "J_kgm2", J, J_STD), tau_s)
+    return Rotor(J, _relative(file, "J_kgm2", J, J_STD), tau_s, file.inverter.f_s_hz)
+
+
+def emf_of(file: MachineFile) -> Emf:
+    """Return what the EMF takes from the current loop of a drive that nobody knows."""
+    return Emf(rotor_of(file).lagging, file.machine.R_s_ohm / file.machine.L_q_h)
 
 
 def learned_gains(file: MachineFile, measured: LearnedLoop) -> dict[str, Learned]:

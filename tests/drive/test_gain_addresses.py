@@ -8,7 +8,7 @@ import pytest
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import NotAvailable
-from pmsmtool.measurement.learn_gains import GAIN, INTEGRAL, gain_address
+from pmsmtool.measurement.learn_gains import DOWN, GAIN, INTEGRAL, changed_counts, gain_address, gain_object
 from tests.drive.table_drive import node_of
 
 
@@ -38,3 +38,13 @@ def test_a_drive_without_such_an_object_is_told_so(family: str, named: str) -> N
         with pytest.raises(NotAvailable) as caught:
             gain_address(node, GAIN)
         assert named in caught.value.what and "0xINDEX:SUB" in caught.value.hint
+
+
+def test_a_gain_that_is_a_float_is_changed_as_one() -> None:
+    """0.7 of the bits of 5.65 is 6e-11, and twice those of 15 a negative gain: both were written to the drive."""
+    place = DriveObject(0x250A, 0, "f")
+    with node_of({place: 5.65}, load_family("ingenia")) as (_, node):
+        gain = gain_object(node, GAIN, *gain_address(node, GAIN))
+        assert gain.counts == pytest.approx(5.65) and changed_counts(gain, DOWN) == pytest.approx(0.7 * 5.65)
+    with node_of({place: 5.65}, load_family("cia402")) as (_, node), pytest.raises(NotAvailable, match="REAL32"):
+        gain_object(node, GAIN, place.index, place.sub)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -14,12 +15,13 @@ J = 2e-3
 COUNT, COUNTS, INTEGRALS = 4e-5, 2000, 500
 A0 = COUNT * COUNTS / J
 RATE = 8.0
-ROTOR = Rotor(J, 0.02, 1.0)
+F_S = 2000.0 / 0.12
+ROTOR = Rotor(J, 0.02, 1.0, F_S)
 P, I = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"  # noqa: E741
 
 
 def loop(a: float, b: float, amps: float = 0.02) -> SpeedLoop:
-    return SpeedLoop(a, b, 2e-3, 1e-3, amps, 1.0)
+    return SpeedLoop(a, b, 2e-3, 1e-3, amps)
 
 
 def b_of(form: str, gain: int, integral: int) -> float:
@@ -60,7 +62,7 @@ def test_what_is_not_told_apart_stays_unknown() -> None:
 def test_steps_of_two_sizes_say_what_friction_leaves() -> None:
     base, gain_changed, integral_changed = observed("rate", half_size=-0.04)
     found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
-    assert found.scale == pytest.approx(math.exp(0.04) * RATE / INTEGRALS)
+    assert found.scale == pytest.approx(RATE / INTEGRALS)
     base, gain_changed, integral_changed = observed("rate", half_size=-0.15)
     found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
     assert found.scale is None and "too wide" in found.why
@@ -77,7 +79,7 @@ def test_a_response_that_does_not_follow_the_counts_decides_nothing() -> None:
     half = Observation(1400, INTEGRALS, loop(A0 * math.sqrt(0.7), A0 * RATE))
     assert "exponent 0.50" in gain_scale(base, half, ROTOR, P).why
     assert gain_scale(base, None, ROTOR, P).scale is None
-    wide = gain_scale(base, gain_changed, Rotor(J, 0.1, 1.0), P)
+    wide = gain_scale(base, gain_changed, Rotor(J, 0.1, 1.0, F_S), P)
     assert wide.scale is None and "too wide" in wide.why
 
 
@@ -91,19 +93,25 @@ def test_an_integral_that_moves_the_gain_too_is_not_one() -> None:
 def test_convention_from_the_acceleration_of_an_ampere(kind: str, ratio: float) -> None:
     torque_per_apk = 0.3
     shown = [Observation(1, 1, loop(A0, A0 * RATE, amps=J / (torque_per_apk * ratio)))] * 2
-    assert convention(shown, Rotor(J, 0.005, 1.0), torque_per_apk, 0.005, 1.0).kind in (None, kind)
-    wide = convention(shown, Rotor(J, 0.04, 1.0), torque_per_apk, 0.03, 1.0)
+    assert convention(shown, Rotor(J, 0.005, 1.0, F_S), torque_per_apk, 0.005, 1.0).kind in (None, kind)
+    wide = convention(shown, Rotor(J, 0.04, 1.0, F_S), torque_per_apk, 0.03, 1.0)
     assert wide.kind == ("rms" if kind == "rms" else None)
     read_as_rms = [Observation(1, 1, loop(A0, A0 * RATE, amps=math.sqrt(2.0) * J / (torque_per_apk * ratio)))]
-    assert convention(read_as_rms, Rotor(J, 0.04, 1.0), torque_per_apk, 0.03, math.sqrt(2.0)).kind == wide.kind
+    assert convention(read_as_rms, Rotor(J, 0.04, 1.0, F_S), torque_per_apk, 0.03, math.sqrt(2.0)).kind == wide.kind
 
 
-def test_a_light_rotor_leaves_a_gain_unknown_but_not_a_time() -> None:
+def test_a_light_rotor_leaves_gains_unknown() -> None:
     base, gain_changed, integral_changed = observed("time")
-    light = Rotor(J, 0.02, 3e-3)  # its EMF may hold back a sixth of the torque, more or less
+    light = Rotor(J, 0.02, 3e-3, F_S)  # its EMF may hold back a sixth of the torque, more or less
     assert gain_scale(base, gain_changed, light, P).scale is None
-    assert integral_scale(base, gain_changed, integral_changed, light, I).scale == pytest.approx(
-        1.0 / RATE / INTEGRALS, rel=3e-3
-    )
-    middle = gain_scale(base, gain_changed, Rotor(J, 0.02, 1e-2), P)
-    assert middle.scale == pytest.approx(1.05 * COUNT) and middle.half_width > 0.08
+    assert integral_scale(base, gain_changed, integral_changed, light, I).scale is None
+    middle = Rotor(J, 0.02, 1e-2, F_S)
+    gain = gain_scale(base, gain_changed, middle, P)
+    assert gain.scale == pytest.approx(COUNT) and gain.half_width > 0.08
+    assert integral_scale(base, gain_changed, integral_changed, middle, I).scale == pytest.approx(1 / RATE / INTEGRALS)
+
+
+def test_a_small_current_leaves_gains_unknown() -> None:
+    base, gain_changed, _ = observed("value")
+    small = [replace(base[0], current_share=0.07), *base[1:]]
+    assert gain_scale(base, gain_changed, ROTOR, P).scale and gain_scale(small, gain_changed, ROTOR, P).scale is None
