@@ -39,7 +39,7 @@ that friction takes back slowly cost up to 8 s per speed with the narrow band. T
 reversal that took longer than the limit gave windows of the wrong direction."""
 RAMP_DOUBT = 1.5
 """Time of a ramp, of what the rough inertia says; friction takes part of the torque."""
-RAMP_MOST_S = 25.0
+RAMP_MOST_S = 35.0
 COAST_LOSS = 0.15
 """Part of its speed that a shaft may lose in one window; one that would lose more keeps the q current that held its
 speed. Ten profiles and random drives lose 0.004 to 0.1, jercic-2017 0.2."""

@@ -60,6 +60,10 @@ has answered, this late. Without the time in which currents settle, which a larg
 one of 1005 drives was braked to a ninth of its speed, by half in one window (seed 70189)."""
 REACTANCE_SHARE = 0.25
 """Voltage that the accelerating current may need at the largest speed, of the largest voltage."""
+RAMP_SHARES, RAMP_S = (0.5, 0.8), 15.0
+"""Accelerating current of the flux run, of the test current, and that of a heavy shaft, which needs longer than so many
+seconds to its largest speed. Two of 40 times the rotor's inertia took 30 to 60 s, longer than anything waited: they did
+not come to rest before their inertia was measured, and a third used up the run's 600 s."""
 REST_SHARE = 0.02
 """Speed that counts as standstill, of the largest of the flux run."""
 
@@ -67,6 +71,29 @@ REST_SHARE = 0.02
 def q_current_s(settle_s: float) -> float:
     """Return how long a q current of the flux run accelerates the shaft (s)."""
     return settle_s + speed_run.Q_WINDOW_S + RUN_I_Q_LATE_S
+
+
+def ramp_of(
+    limits: Limits, omega_rad_s: float, i_most_a: float, torque_per_a: float, J_kgm2: float
+) -> tuple[float, float]:
+    """Return accelerating current (A) and largest mechanical speed (rad/s) of the flux run.
+
+    A heavy shaft gets more current, and turns no faster than that brings it to within :data:`RAMP_S`.
+
+    Parameters
+    ----------
+    limits : Limits
+        What may be used.
+    omega_rad_s, i_most_a : float
+        Largest speed, and the current that the voltage leaves there.
+    torque_per_a, J_kgm2 : float
+        Torque per q current (N m/A), and inertia.
+    """
+    per_ampere = torque_per_a / J_kgm2
+    heavy = omega_rad_s > RAMP_S * per_ampere * RAMP_SHARES[0] * limits.I_test_apk
+    i_run = min(RAMP_SHARES[heavy] * limits.I_test_apk, i_most_a)
+    i_run, omega_rad_s = limits.within_supply(i_run, omega_rad_s, torque_per_a)
+    return i_run, min(omega_rad_s, RAMP_S * per_ampere * i_run)
 
 
 def run_d_current(limits: Limits, L_h: tuple[float, float], period_s: float) -> float:
@@ -236,8 +263,8 @@ class SpeedStage:
         flux = psi + SATURATED * L[0] * run_i_d
         largest = min(limits.omega_max_rad_s / 1.1, EMF_SHARE * limits.V_max_v / (flux * pole_pairs))
         # the accelerating current must leave voltage for itself: omega_e L_q i_q stands beside the back-emf
-        i_run = min(0.5 * limits.I_test_apk, REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L)))
-        i_run, largest = limits.within_supply(i_run, largest, torque_per_ampere(pole_pairs, psi))
+        i_most = REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L))
+        i_run, largest = ramp_of(limits, largest, i_most, torque_per_ampere(pole_pairs, psi), J)
         per_ampere = torque_per_ampere(pole_pairs, psi) / J
         # a current that is slow because the inverter's error is steep would not be steady in its window
         loop = speed_run.steady_loop(

@@ -12,7 +12,7 @@ from pmsmtool.experiments.speed_run import SETTLE_MOST_S, SETTLE_S, SteadyLoop, 
 from pmsmtool.identification.sampling import timing_estimates, timing_warnings
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.limits import Limits
-from pmsmtool.measurement.speeds import run_d_current
+from pmsmtool.measurement.speeds import RAMP_S, ramp_of, run_d_current
 
 R, L, I_LEAST, PERIOD_S, LEAST_RAD_S = 0.4, (1e-3, 1.5e-3), 2.0, 5e-5, 754.0
 STEPS_PER_PERIOD = 4
@@ -107,3 +107,12 @@ def test_the_d_current_grows_with_the_ripple(L_q_h: float, share: float) -> None
     limits = Limits(20.0, 22.0, 100.0, 325.0 / math.sqrt(3.0))
     found = run_d_current(limits, (0.5 * L_q_h, L_q_h), 6.4e-5)
     assert found == pytest.approx(share * limits.I_test_apk, rel=1e-9)
+
+
+@pytest.mark.parametrize(("J_kgm2", "share"), [(1e-3, 0.5), (1.2e-2, 0.8), (0.5, 0.8)])
+def test_a_heavy_shaft_turns_no_faster_than_its_ramps_bring_it(J_kgm2: float, share: float) -> None:
+    """40 times the rotor's inertia took 60 s to its speed, and the run waited 25 s for it."""
+    limits = Limits(5.0, 7.5, 300.0, 30.0)
+    i_run, omega = ramp_of(limits, 280.0, 100.0, 0.075, J_kgm2)
+    assert i_run == share * limits.I_test_apk and omega <= RAMP_S * 0.075 * i_run / J_kgm2
+    assert (omega == 280.0) is (J_kgm2 < 0.1)
