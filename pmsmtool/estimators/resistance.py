@@ -231,7 +231,7 @@ def estimate_resistance(
     samples = int(levels.meta["samples"])
     peak = float(np.max(np.abs(i)))
     R_0 = two_point_slope(i, v)
-    _check_levels(levels, i, peak, R_0, noise)
+    _check_levels(levels, i, peak, noise)
     noise_v = MEAN_NOISE_FACTOR * R_0 * noise.sigma_a / math.sqrt(samples)
     T = levels["T_winding_c"]
     known_T = bool(np.all(np.isfinite(T)))
@@ -384,7 +384,7 @@ def two_point_slope(i: Array, v: Array) -> float:
     return R_0
 
 
-def _check_levels(levels: Trace, i: Array, peak: float, R_0: float, noise: Noise) -> None:
+def _check_levels(levels: Trace, i: Array, peak: float, noise: Noise) -> None:
     used = np.abs(i) >= FIT_FROM * peak
     for sign in (1.0, -1.0):
         count = len(set(np.round(i[used & (np.sign(i) == sign)] / (0.02 * peak))))
@@ -394,7 +394,7 @@ def _check_levels(levels: Trace, i: Array, peak: float, R_0: float, noise: Noise
                 f"{count} different levels of one sign above {FIT_FROM:g} of the largest, {TAIL_TERMS + 3} needed",
                 stage=STAGE,
             )
-    change, limit = _settling(levels, peak, R_0, noise)
+    change, limit = _settling(levels, noise)
     worst = int(np.argmax(np.abs(change) / limit))
     if abs(change[worst]) > limit[worst]:
         raise refuse(
@@ -405,19 +405,23 @@ def _check_levels(levels: Trace, i: Array, peak: float, R_0: float, noise: Noise
         )
 
 
-def _settling(levels: Trace, peak: float, R_0: float, noise: Noise) -> tuple[Array, Array]:
+def _settling(levels: Trace, noise: Noise) -> tuple[Array, Array]:
     """Change of v - R i between the halves of each window, and its limit (V)."""
+    i = levels["i_d_a"]
+    peak, R_0 = float(np.max(np.abs(i))), two_point_slope(i, levels["u_d_v"])
     change = (levels["u_d_second_v"] - levels["u_d_first_v"]) - R_0 * (levels["i_d_second_a"] - levels["i_d_first_a"])
+    # what most windows change by, but not all one way, is the ripple of a link: they hold no whole periods of it
+    one_way = np.ones_like(i), np.sign(i), levels["u_d_v"]
+    ripple = min(float(np.median(np.abs(change - shape * np.median(change / shape)))) for shape in one_way)
     sigma = 2.0 * R_0 * noise.sigma_a / math.sqrt(int(levels.meta["samples"]))  # difference of two halves
-    fit_limit = max(SETTLE_SIGMA * sigma, SETTLE_FLOOR * R_0 * peak)
+    fit_limit = max(SETTLE_SIGMA * max(sigma, ripple), SETTLE_FLOOR * R_0 * peak)
     curve_limit = max(fit_limit, CURVE_SETTLE * float(np.max(np.abs(levels["u_d_v"]))))
-    return change, np.where(np.abs(levels["i_d_a"]) >= FIT_FROM * peak, fit_limit, curve_limit)
+    return change, np.where(np.abs(i) >= FIT_FROM * peak, fit_limit, curve_limit)
 
 
 def unsettled(levels: Trace, noise: Noise) -> NDArray[np.bool_]:
     """Levels whose voltage still moves: at some currents the rotor of a reluctance machine leaves the vector slowly."""
-    i, v = levels["i_d_a"], levels["u_d_v"]
-    change, limit = _settling(levels, float(np.max(np.abs(i))), two_point_slope(i, v), noise)
+    change, limit = _settling(levels, noise)
     return np.asarray(np.abs(change) > limit)
 
 

@@ -437,6 +437,17 @@ def test_the_low_levels_may_settle_more_slowly_than_those_that_make_R() -> None:
                 estimate_resistance(slow, noise_of(d, 0))
 
 
+def test_the_ripple_of_a_link_is_no_voltage_that_has_not_settled() -> None:
+    """Windows hold no whole periods of it: R, and all that needs R, was refused at 0.0202 V, limit 0.0141."""
+    rng = np.random.default_rng(12)
+    d = replace_inverter(draw(1, rng))
+    trace = levels_of(d, 0, rng)
+    ripple = 2e-3 * float(np.max(trace["u_d_v"])) * rng.standard_normal(len(trace))
+    shaken = with_signals(trace, u_d_first_v=trace["u_d_v"] - ripple, u_d_second_v=trace["u_d_v"] + ripple)
+    found = estimate_resistance(shaken, noise_of(d, 0)).R_s
+    assert abs(found.value / d.R[0] - 1.0) < COVERAGE_FACTOR * found.std / d.R[0]
+
+
 def test_an_inverter_without_an_error_has_a_knee_within_its_levels() -> None:
     """A plateau and a curve of noise: the fit must not run away (it overflowed)."""
     rng = np.random.default_rng(5)

@@ -317,9 +317,8 @@ def _average(
     rows = [row for row in rows if np.isfinite(row[3][0, 0]) and row[1].cost < UNPHYSICAL]
     # a rotor cannot push back: where the data alone decide, such a model fitted something else. A value that other
     # experiments put near zero scatters to both sides of it, and is in every model. Nor do eddy currents drive
-    firsts = [layout.responses(fit.x)[0] for _, fit, layout, _ in rows]
-    of_rotor = [row[2].motion is not None or first.motion >= 0.0 for row, first in zip(rows, firsts, strict=True)]
-    rows = [row for row, first, ok in zip(rows, firsts, of_rotor, strict=True) if ok and first.model.eddy_s >= 0.0]
+    firsts = [(row, row[2].responses(row[1].x)[0]) for row in rows]
+    rows = [row for row, at in firsts if at.model.eddy_s >= 0.0 and (row[2].motion is not None or at.motion >= 0.0)]
     if not rows:
         raise refuse("E_NOT_CONVERGED", "no model of the axis could be fitted", stage="inductance")
     weights = information_weights([_criterion(fit, layout, timing) for _, fit, layout, _ in rows])
