@@ -29,9 +29,9 @@ this limit; the spread has as much more."""
 UNSEEN = 2.0
 """Deviation from a mean that is not known, of the change that was seen: where cogging kept the rotor off a quarter of a
 turn, 2.4 % of deviation showed as 1.7 %."""
-UNSEEN_RANGE = 0.03
+UNSEEN_RANGE = 0.05
 """Deviation from the mean that is assumed where no two angles a quarter of a turn apart were seen: of the 1 to 5 % that
-phases and slots make, a sixth harmonic of 3 % put L 2.9 % off, a phase with 3 % more 3.0 %."""
+phases and slots make, a sixth harmonic of 4.3 % put L 5.0 % off, a phase with 3 % more 3.0 %."""
 UNEVEN = 0.004
 """Change over the angle from which on it counts; a drive with equal phases showed 0.0014 on d and 0.0008 on q."""
 
