@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: MIT
+"""Values that lie on a bound, and conversions that the longer tests leave out."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from pmsmtool.drive import motion_objects as motion
+from pmsmtool.drive import objects
+from pmsmtool.drive.drive_node import LEAST_LINK_V
+from pmsmtool.drive.mapped_recorder_drive import LINEAR_SHARE, MappedRecorderDrive
+from pmsmtool.drive.port import Recording
+from pmsmtool.drive.position_drive import PositionDrive
+from pmsmtool.errors import NotAvailable
+from pmsmtool.trace import Trace
+from tests.drive.table_drive import node_of
+
+
+class Recorded(MappedRecorderDrive):
+    """A drive of two pole pairs whose recorder holds four rows; its link shows 300 V."""
+
+    U_dc_v = 300.0
+
+    def __init__(self, trace: Trace) -> None:
+        self.asked: list[Any] = []
+        self.trace = trace
+        self.traces = cast(Any, SimpleNamespace(fetch=self._fetch))
+        self._apart, self._own_pole_pairs = 3, 2.0
+
+    def _fetch(self, *asked: Any) -> Trace:
+        self.asked.append(asked)
+        return self.trace
+
+    def live(self, name: str) -> float:
+        return self.U_dc_v
+
+    def coast(self) -> None: ...
+
+    def check_operating(self) -> None: ...
+
+
+def test_a_makers_record_by_the_names_asked_for() -> None:
+    """Electrical speed and the samples at the linear range's end are of the program's making; every third row fits."""
+    top = LINEAR_SHARE * 300.0 / math.sqrt(3.0)
+    u = np.array([0.0, 0.99 * top, 1.01 * top, -1.01 * top])
+    signals = {"omega_M_rad_s": np.arange(4.0), "i_q_a": np.ones(4), "u_d_v": np.zeros(4), "u_q_v": u}
+    drive = Recorded(Trace(np.arange(4.0), signals, dict.fromkeys(signals, "1")))
+    found = drive.finish_record(Recording(("omega_e_rad_s", "i_q_a", "u_d_v", "u_q_v", "flags"), 12, decimation=2))
+    assert drive.asked[0][1] == 6
+    assert found["omega_e_rad_s"].tolist() == [0.0, 2.0, 4.0, 6.0] and found["i_q_a"].tolist() == [1.0] * 4
+    assert found["flags"].tolist() == [0.0, 0.0, 1.0, 1.0]
+    without = {name: values for name, values in signals.items() if name != "u_d_v"}
+    bare = Recorded(Trace(np.arange(4.0), without, dict.fromkeys(without, "1")))
+    assert not bare.finish_record(Recording(("i_q_a", "flags"), 4))["flags"].any()
+
+
+@pytest.mark.parametrize(
+    ("link_v", "said"), [(LEAST_LINK_V - 1e-3, "supply of the power stage"), (LEAST_LINK_V, "5 V"), (24.0, "24 V")]
+)
+def test_the_link_tells_the_supply_from_the_inputs(link_v: float, said: str) -> None:
+    with node_of({objects.DC_LINK_MV: round(1e3 * link_v)}) as (_, node):
+        assert said in node._kept_off_by()
+
+
+def test_a_position_factor_that_says_nothing_new() -> None:
+    """4000 increments of the encoder are 2000 units of a factor 2: both say the same of a turn."""
+    turn = {motion.POSITION: 0, motion.ENCODER_COUNTS: 4000, motion.FEED: 2000, motion.FACTOR: 2}
+    with node_of(turn) as (_, node):
+        assert motion.position_units(node) == 2000.0
+    with node_of({**turn, motion.FEED: 2000, motion.FACTOR: 4, motion.FACTOR_DIVISOR: 2}) as (_, node):
+        assert motion.position_units(node) == 2000.0
+    with node_of({**turn, motion.FACTOR: 4}) as (_, node), pytest.raises(NotAvailable, match="factor of 4"):
+        motion.position_units(node)
+
+
+def test_the_angle_of_one_count() -> None:
+    drive = object.__new__(PositionDrive)
+    drive.counts_per_turn = -4000
+    assert drive.rad_per_count == pytest.approx(2.0 * math.pi / 4000.0, rel=1e-15)
