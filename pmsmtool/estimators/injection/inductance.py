@@ -428,7 +428,9 @@ def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, U_dc_v: float
         )
     if "flagged" in trace.signals and np.any(trace["flagged"] > 0.0):
         raise refuse("E_CLIPPED", f"{int(np.sum(trace['flagged'] > 0.0))} samples limited or clipped", stage=stage)
-    _check_rotor(float(trace.meta["pole_pairs"]) * trace["theta_M_rad"], stage)
+    way = math.degrees(rotor_way(float(trace.meta["pole_pairs"]) * trace["theta_M_rad"]))
+    if way > (most := math.degrees(ROTOR_LIMIT_RAD)):
+        raise refuse("E_ROTOR_MOVED", f"the rotor moved by {way:.2g} deg (electrical), limit {most:g} deg", stage=stage)
     other = "q" if axis == "d" else "d"
     i, cross = trace[f"i_{axis}_a"], trace[f"i_{other}_a"]
     error = None
@@ -447,20 +449,14 @@ def _pulse_height(frame_rad: float, axis: str, U_dc_v: float) -> float:
     return U_dc_v / float(np.ptp(legs))
 
 
-def _check_rotor(theta_e: Array, stage: str) -> None:
+def rotor_way(theta_e: Array) -> float:
+    """Return how far the rotor went in a record (rad electrical), beyond an encoder's step and scatter."""
     moves = np.abs(np.diff(theta_e))
     moves = moves[moves > 1e-9]
     step = float(np.min(moves)) if len(moves) else 0.0
     # what the encoder scatters is no motion: as far as so many normal numbers reach to both sides
     scatter = 2.0 * position_noise(theta_e) * math.sqrt(2.0 * math.log(len(theta_e)))
-    span = float(np.ptp(theta_e)) - max(step, scatter)
-    if span > ROTOR_LIMIT_RAD:
-        raise refuse(
-            "E_ROTOR_MOVED",
-            f"the rotor moved by {math.degrees(span):.2g} deg (electrical), "
-            f"limit {math.degrees(ROTOR_LIMIT_RAD):g} deg",
-            stage=stage,
-        )
+    return float(np.ptp(theta_e)) - max(step, scatter)
 
 
 def _cross_response(shot: Shot, fit: AxisFit, sigma_a: float) -> tuple[float, float]:

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: MIT
+"""A shot of square waves in which the rotor still moves is recorded again, with a longer lead."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pmsmtool.estimators.encoder import EncoderResult
+from pmsmtool.experiments import square_injection
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.measurement.square_waves import LEADS, SquareStage
+from pmsmtool.trace import Trace
+
+PAIRS = 4
+ENCODER = EncoderResult(Estimate(PAIRS, 0.0, 0.0, "1"), 1, Estimate(0.0, 0.0, 0.0, "rad"), 0.0)
+PLAN = square_injection.SquarePlan(30.0, 15.0, 50.0)
+
+
+@pytest.mark.parametrize(
+    ("ways_deg", "recorded"), [((0.1, 9.0, 9.0), 1), ((3.1, 0.4, 9.0), 2), ((9.0, 2.5, 0.3), 3), ((9.0, 2.5, 2.4), 3)]
+)
+def test_a_shot_is_recorded_until_the_rotor_stands_still(
+    ways_deg: tuple[float, ...], recorded: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """mtpv-test with a winding of 42 to 90 degC lost L_d and L_q: its rotor came back by 3.1 degrees in one shot."""
+    plans: list[square_injection.SquarePlan] = []
+
+    def inject(drive: Any, plan: square_injection.SquarePlan, *rest: Any) -> Trace:
+        way = math.radians(ways_deg[len(plans)]) / PAIRS
+        plans.append(plan)
+        return Trace(np.arange(400) / 8e3, {"theta_M_rad": np.linspace(0.0, way, 400)}, {"theta_M_rad": "rad"})
+
+    monkeypatch.setattr(square_injection, "inject_square", inject)
+    stage = SquareStage(*[None] * 4, ripple_share=0.25)  # type: ignore[arg-type]
+    shot = stage._still(ENCODER, PLAN, "q", 9, 50.0)
+    assert [plan.lead_s for plan in plans] == pytest.approx([lead * PLAN.lead_s for lead in LEADS[:recorded]])
+    assert math.degrees(float(shot["theta_M_rad"][-1])) * PAIRS == pytest.approx(ways_deg[recorded - 1])
