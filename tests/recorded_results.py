@@ -1,15 +1,20 @@
 # SPDX-License-Identifier: MIT
 """What the functions under test return, compared with what they returned when somebody last looked.
 
-Every test of a folder whose ``conftest.py`` has :func:`recorded` is watched. The numbers in the results of the pure
+Every test of a folder whose ``conftest.py`` has :func:`recorded` can be watched. The numbers in the results of the pure
 rooms' functions it calls, of every sixteenth call of the control core, and of what is written over SDO, are added up
 with fixed weights. The sum of each function is compared with ``recorded.json`` of that folder. This stands beside the
-tests against independent sources: a recorded number says that something has changed, not that it was right before.
-After an intended change, look at which tests the difference names, and renew. What then still differs from run to run,
+tests against independent sources: a recorded number says that something has changed, not that it was right before. It
+says so of every intended change as well, and of another processor's last digits. So it is done only where it is asked
+for: by somebody who moves code whose results must stay, and by ``python -m benchmarks.mutations``:
+
+    PMSMTOOL_RECORDED=compare python -m pytest tests/design
+
+After intended changes look at which tests the difference names, and renew. What then still differs from run to run,
 or with another kernel of OpenBLAS, is marked and no longer compared:
 
-    PMSMTOOL_RENEW=all python -m pytest tests/design -p no:xdist
-    PMSMTOOL_RENEW=unsteady OPENBLAS_CORETYPE=Prescott python -m pytest tests/design -p no:xdist
+    PMSMTOOL_RECORDED=renew python -m pytest tests/design -p no:xdist
+    PMSMTOOL_RECORDED=unsteady OPENBLAS_CORETYPE=Prescott python -m pytest tests/design -p no:xdist
 """
 
 from __future__ import annotations
@@ -170,8 +175,9 @@ def _watching_download(function: Callable[..., Transfer], seen: Seen) -> Callabl
 
 @pytest.fixture(autouse=True)
 def recorded(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Watch a test and compare what it saw; a test that draws its own examples is left alone."""
-    if getattr(request.function, "is_hypothesis_test", False):
+    """Where it is asked for, watch a test and compare what it saw; one that draws its own examples is left alone."""
+    asked = os.environ.get("PMSMTOOL_RECORDED", "")
+    if not asked or getattr(request.function, "is_hypothesis_test", False):
         yield
         return
     folder, seen = request.path.parent, Seen()
@@ -191,12 +197,11 @@ def recorded(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
     path, test = folder / "recorded.json", f"{request.path.name}::{request.node.nodeid.partition('::')[2]}"
     sums = {name: total for name, numbers in sorted(seen.items()) if (total := numbers.sum())[0]}
-    renew = os.environ.get("PMSMTOOL_RENEW")
-    if renew:
+    if asked != "compare":
         rows = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
         held = rows.get(test, {})
         unsteady = {name for name, row in held.items() if row is None}
-        if renew == "unsteady":
+        if asked == "unsteady":
             unsteady |= {name for name, row in held.items() if row and not _agree(row, sums.get(name, (0, 0.0)))}
             sums = held
         rows[test] = {name: None if name in unsteady else row for name, row in sums.items()}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Every test here is watched by :mod:`tests.recorded_results`."""
+"""Every test here can be watched by :mod:`tests.recorded_results`."""
 
 from tests.recorded_results import recorded
 
