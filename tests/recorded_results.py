@@ -29,7 +29,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -173,6 +173,17 @@ def _watching_download(function: Callable[..., Transfer], seen: Seen) -> Callabl
     return watched
 
 
+PASSED = pytest.StashKey[bool]()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Note whether a test passed: one that is skipped half way has seen less."""
+    report = yield
+    item.stash[PASSED] = report.passed
+    return report
+
+
 @pytest.fixture(autouse=True)
 def recorded(request: pytest.FixtureRequest) -> Iterator[None]:
     """Where it is asked for, watch a test and compare what it saw; one that draws its own examples is left alone."""
@@ -195,6 +206,8 @@ def recorded(request: pytest.FixtureRequest) -> Iterator[None]:
         if folder.name in ("drive", "flash"):
             patch.setattr(SdoChannel, "download", _watching_download(SdoChannel.download, seen))
         yield
+    if not request.node.stash.get(PASSED, False):
+        return
     path, test = folder / "recorded.json", f"{request.path.name}::{request.node.nodeid.partition('::')[2]}"
     sums = {name: total for name, numbers in sorted(seen.items()) if (total := numbers.sum())[0]}
     if asked != "compare":
