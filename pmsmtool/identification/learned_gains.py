@@ -24,7 +24,7 @@ SMALL_CURRENT = 0.006
 inverter's dead time holds the current back. Measured at 7 % of it: K_p -20 %."""
 CURRENT_BANDWIDTH, BANDWIDTH_DOUBT = 0.12, 0.7
 """What a maker's current loop has (rad/s) over its switching frequency (Hz), about: 0.05 to 0.3; the standard deviation
-of what follows from it (relative)."""
+of the EMF's share that follows from it (relative)."""
 CHANGE_DOUBT = (0.03, 0.05, 0.04)
 """What it leaves of a ratio of two K_p, K_i or K_i / K_p of one drive (standard deviation, relative)."""
 SPREAD_DOUBT = 0.5
@@ -56,6 +56,7 @@ EXPONENTS = {
 """How K_i follows the counts of the gain and of the integral part: parallel, and three series forms.
 
 The integral part leaves K_p alone, so that its effect is seen in K_i / K_p, which a fit knows better than K_i."""
+NO_DOUBT = (0.0, 0.0, 0.0)
 UNITS = {"gain": "N m s/rad", "value": "N m/rad", "rate": "1/s", "time": "s"}
 
 
@@ -84,25 +85,28 @@ class Rotor:
         """By how much the inertia seems larger, for the current lags the EMF (relative)."""
         return 1.0 / (CURRENT_BANDWIDTH * self.f_s_hz * self.time_constant_s)
 
-    @property
-    def lag_std(self) -> float:
-        """Standard deviation of what that leaves of a gain (relative)."""
-        return BANDWIDTH_DOUBT * self.lagging
-
-    @property
-    def std(self) -> float:
-        """Standard deviation of a gain that is known by its share of the inertia (relative)."""
-        return math.hypot(self.J_std, self.lag_std)
-
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One measured loop, the counts that both gains held meanwhile, and the largest current over the rated one."""
+    """One measured loop, and what was so meanwhile.
+
+    Attributes
+    ----------
+    gain, integral : float
+        Counts that both gains held.
+    loop : SpeedLoop
+        What was measured.
+    current_share : float
+        Largest current over the rated one.
+    emf_std : tuple of float
+        Standard deviation of K_p, K_i and K_i / K_p (relative) by the EMF's share, which is not known.
+    """
 
     gain: float
     integral: float
     loop: SpeedLoop
     current_share: float = 1.0
+    emf_std: tuple[float, float, float] = NO_DOUBT
 
     @property
     def std(self) -> float:
@@ -155,9 +159,23 @@ class Convention:
 K_P, K_I, RATE = 0, 1, 2
 
 
+def _logs(loop: SpeedLoop) -> tuple[float, float, float]:
+    K_p, K_i = math.log(loop.K_p_per_J), math.log(loop.K_i_per_J)
+    return K_p, K_i, K_i - K_p
+
+
+def emf_doubt(one: SpeedLoop, other: SpeedLoop, most: float) -> tuple[float, float, float]:
+    """Return half of what two loops differ in K_p, K_i and K_i / K_p (relative), at most ``most``.
+
+    That is what the EMF's share may be off. The loops answer one record with both ends of the share; a fit that ends
+    elsewhere must not say more.
+    """
+    K_p, K_i, rate = (min(most, 0.5 * abs(a - b)) for a, b in zip(_logs(one), _logs(other), strict=True))
+    return K_p, K_i, rate
+
+
 def _log(observation: Observation, which: int) -> float:
-    loop = observation.loop
-    return math.log((loop.K_p_per_J, loop.K_i_per_J, loop.K_i_per_J / loop.K_p_per_J)[which])
+    return _logs(observation.loop)[which]
 
 
 def _change(after: Observation, base: Sequence[Observation], which: int) -> tuple[float, float]:
@@ -200,7 +218,7 @@ def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, ro
         return Learned(name, None, math.inf, None, "", why)
     logs = [_log(o, K_P) - math.log(o.gain) for o in (base[0], gain_changed, base[1])]
     mean, std = _of_all(logs[:-1], logs[-1])
-    std = math.hypot(std, MODEL_DOUBT[0], base[0].std, rotor.std)
+    std = math.hypot(std, MODEL_DOUBT[0], base[0].std, base[0].emf_std[K_P], rotor.J_std)
     scale, half = rotor.J_kgm2 * math.exp(mean), NORMAL_95 * std
     if half > WIDEST:
         return Learned(name, None, half, "value", UNITS["gain"], f"its interval of {100 * half:.0f} % is too wide")
@@ -249,7 +267,8 @@ def integral_scale(
         kept = _log(o, RATE if relative else K_I)
         logs.append((-kept if best == "time" else kept) - math.log(o.integral))
     mean, std = _of_all(logs[:-1], logs[-1])
-    half = NORMAL_95 * math.hypot(std, MODEL_DOUBT[1], base[0].std, rotor.lag_std if relative else rotor.std)
+    emf_std = base[0].emf_std[RATE if relative else K_I]
+    half = NORMAL_95 * math.hypot(std, MODEL_DOUBT[1], base[0].std, emf_std, 0.0 if relative else rotor.J_std)
     if half > WIDEST:
         return unknown(f"its interval of {100 * half:.0f} % is too wide", best, half)
     scale = math.exp(mean) if relative else rotor.J_kgm2 * math.exp(mean)

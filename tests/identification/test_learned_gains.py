@@ -8,7 +8,14 @@ from dataclasses import replace
 
 import pytest
 
-from pmsmtool.identification.learned_gains import Observation, Rotor, convention, gain_scale, integral_scale
+from pmsmtool.identification.learned_gains import (
+    Observation,
+    Rotor,
+    convention,
+    emf_doubt,
+    gain_scale,
+    integral_scale,
+)
 from pmsmtool.identification.speed_loop_response import SpeedLoop
 
 J = 2e-3
@@ -100,15 +107,17 @@ def test_convention_from_the_acceleration_of_an_ampere(kind: str, ratio: float) 
     assert convention(read_as_rms, Rotor(J, 0.04, 1.0, F_S), torque_per_apk, 0.03, math.sqrt(2.0)).kind == wide.kind
 
 
-def test_a_light_rotor_leaves_gains_unknown() -> None:
+def test_what_the_emf_may_take_is_in_the_interval_that_it_moves() -> None:
     base, gain_changed, integral_changed = observed("time")
-    light = Rotor(J, 0.02, 3e-3, F_S)  # its EMF may hold back a sixth of the torque, more or less
-    assert gain_scale(base, gain_changed, light, P).scale is None
-    assert integral_scale(base, gain_changed, integral_changed, light, I).scale is None
-    middle = Rotor(J, 0.02, 1e-2, F_S)
-    gain = gain_scale(base, gain_changed, middle, P)
-    assert gain.scale == pytest.approx(COUNT) and gain.half_width > 0.08
-    assert integral_scale(base, gain_changed, integral_changed, middle, I).scale == pytest.approx(1 / RATE / INTEGRALS)
+    ends = loop(A0, A0 * RATE), loop(1.16 * A0, 1.16 * A0 * RATE)
+    moved = emf_doubt(*ends, 0.1)
+    assert moved == pytest.approx((0.074, 0.074, 0.0), abs=1e-3)
+    assert emf_doubt(*ends, 0.05) == pytest.approx((0.05, 0.05, 0.0))
+    light = [replace(base[0], emf_std=moved), *base[1:]]
+    assert gain_scale(light, gain_changed, ROTOR, P).scale is None
+    assert integral_scale(light, gain_changed, integral_changed, ROTOR, I).scale == pytest.approx(
+        1.0 / RATE / INTEGRALS, rel=3e-3
+    )
 
 
 def test_a_small_current_leaves_gains_unknown() -> None:
