@@ -103,6 +103,7 @@ def _below_full(bus: BusOptions, map_file: Path | None) -> Capabilities | None:
     from pmsmtool.measurement.capabilities import CapabilityLevel, examine
 
     with open_node(bus, within_s=LOOKING_S) as node:
+        node.refuse_late()
         found = examine(node, None if map_file is None else read_map(map_file))
     return None if found.level in (CapabilityLevel.FULL, CapabilityLevel.INJECT) else found
 

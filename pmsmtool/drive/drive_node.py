@@ -38,6 +38,8 @@ READY_TIMEOUT_S = 3.0
 LEAST_LINK_V = 5.0
 """A DC link below this has no supply; the smallest drives of this kind work from about 10 V."""
 POLL_S = 0.005
+LOOKS, MEAN_ANSWER_S = 8, 0.1
+"""Answers that are timed before a first motion, and their largest mean: a slow gateway takes some tens of ms."""
 IDENTITY_BYTES = 4
 LONGEST_NAME = 256
 """Bytes of 0x1008 to 0x100A that are read; drives use up to 64."""
@@ -239,12 +241,33 @@ class DriveNode:
 
     def answer_s(self) -> float:
         """Return how long an answer takes (s): the shortest of three."""
+        return min(self._answers_s(3))
+
+    def _answers_s(self, number: int) -> list[float]:
         clock, took_s = self.connection.clock, []
-        for _ in range(3):
+        for _ in range(number):
             asked_s = clock.now()
             self.state()
             took_s.append(clock.now() - asked_s)
-        return min(took_s)
+        return took_s
+
+    def refuse_late(self) -> None:
+        """Refuse a drive whose answers take too long for motion that is looked at.
+
+        Raises
+        ------
+        DriveTimeout
+            With how long they take.
+        """
+        took_s = self._answers_s(LOOKS)
+        mean_s = sum(took_s) / LOOKS
+        if mean_s > MEAN_ANSWER_S:
+            raise DriveTimeout(
+                f"the drive answers late: {LOOKS} answers took {1e3 * mean_s:.0f} ms on average and up to "
+                f"{1e3 * max(took_s):.0f} ms; a motion needs {1e3 * MEAN_ANSWER_S:.0f} ms or less",
+                where=f"node {self.node}, 0x6041:00", likely="a busy drive, a slow gateway or adapter, or a full bus",
+                hint="nothing was energised; bring the drive nearer to this program, or take load off the bus",
+            )  # fmt: skip
 
     def enable(self) -> None:
         """Walk to OPERATION ENABLED.
