@@ -26,6 +26,8 @@ _HAVE_SUBS = frozenset({0x06, 0x08, 0x09})  # DEFSTRUCT, ARRAY, RECORD
 _SECTION = re.compile(r"\s*\[([^\]]*)\]?\s*(?:;.*)?$")
 _OBJECT = re.compile(r"([0-9A-Fa-f]{1,4})(?:sub([0-9A-Fa-f]{1,2}))?\Z", re.IGNORECASE)
 _REMARK = re.compile(r"[;#]|//")
+OCTAL = re.compile("0[0-7]+")
+"""As C writes it; makers rather fill decimal numbers up with zeros."""
 _NODE_ID = re.compile(r"\$NODEID", re.IGNORECASE)
 _ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
 _WORDED = {"readwrite": "rw", "read": "ro", "readonly": "ro", "write": "wo", "writeonly": "wo", "constant": "const"}
@@ -289,6 +291,10 @@ def _entry(
     for key in ("lowlimit", "highlimit"):
         limit = _number(section.get(key), data_type, f"{place}sub{sub:X} {key}", warnings, node)
         limits.append(limit)
+    for key in ("lowlimit", "highlimit", "defaultvalue", "parametervalue"):
+        text = section.get(key)
+        if data_type in INTEGER_BITS and OCTAL.fullmatch(text) and int(text) != int(text, 8):
+            warnings.append(f"{place}sub{sub:X} {key}: {text} is taken for a decimal; an octal one is {int(text, 8)}")
     return EdsObject(
         index,
         sub,

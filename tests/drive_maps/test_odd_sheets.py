@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.drive_maps.eds import parse_eds, parse_integer
 from pmsmtool.errors import ConfigError
+from pmsmtool.sim.foreign.drive import assumptions_of
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.node.dictionary import Entry
+from tests.foreign.data_sheets import unknown, write_eds
 
 ENCODINGS = ("utf-8", "utf-8-sig", "utf-16", "utf-16-le", "cp1252")
 INTEGERS = sorted((row.code, 8 * row.size, row.is_signed) for row in DATA_TYPES.values() if row.is_integer)
@@ -99,3 +101,15 @@ def test_a_file_of_another_size_than_is_read_is_refused(tmp_path: Path) -> None:
         file.truncate(50 << 20)
     with pytest.raises(ConfigError, match="more than the 8 MiB"):
         read_makers_objects(str(path))
+
+
+def test_how_odd_lines_are_read_is_told(tmp_path: Path) -> None:
+    """A section that stood twice, and a number that CiA 306 lets be octal, were read one way without a word."""
+    rows = [(*row[:4], "0762" if row[0] == 0x6073 else row[4]) for row in unknown()]
+    path = write_eds(tmp_path / "x.eds", rows)
+    assert assumptions_of(str(path)) == (
+        "line 95: 6073sub0 defaultvalue: 0762 is taken for a decimal; an octal one is 498",
+    )
+    path.write_text(path.read_text("ascii") + 5 * "[6075]\nDefaultValue=9000\n", encoding="ascii")
+    told = assumptions_of(str(path))
+    assert "section [6075] stands twice, merged" in told[0] and told[3].startswith("and ")

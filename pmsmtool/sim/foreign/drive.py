@@ -19,7 +19,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.families import assumed_modes, family_of, laws_of, modes_of, units_of
-from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects, read_makers_objects
+from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects, oddities_of, read_makers_objects
 from pmsmtool.sim.foreign.guarding import NodeGuarding
 from pmsmtool.sim.foreign.laws import Law
 from pmsmtool.sim.foreign.position import PositionLoop
@@ -193,7 +193,8 @@ class ForeignDrive:
 def assumptions_of(file: str, machine_file: MachineFile | None = None) -> tuple[str, ...]:
     """Return what a rehearsal with a file (path, or ``TABLE.csv#FAMILY``) assumes of the drive, one line each.
 
-    That is the modes of operation, where the file does not announce them, and what of a motor its limits cannot hold.
+    That is the modes of operation, where the file does not announce them, and what of a motor its limits cannot hold;
+    before them stands how odd lines of the file are read.
 
     Raises
     ------
@@ -209,7 +210,7 @@ def assumptions_of(file: str, machine_file: MachineFile | None = None) -> tuple[
         )  # fmt: skip
     assumed = assumed_modes(objects)
     modes = ", ".join(str(bit + 1) for bit in range(16) if assumed >> bit & 1)
-    lines = (
+    lines = oddities_of(file) + (
         [f"0x6502 is blank: modes {modes} are assumed by its objects; a real drive reports its own"] if assumed else []
     )
     return (*lines, *(() if machine_file is None else ForeignDrive(objects, set_up_of(machine_file)).unheld))

@@ -37,6 +37,8 @@ _MAPPED_AS = {8: ("U8", "0"), 16: ("U16", "0"), 32: ("U32", "0"), 64: ("U64", "0
 CONSUMER_LIMIT = 0x7FFFFF
 """Largest entry of 0x1016: a node id above 16 bits of time (CiA 301); files with 65535 leave no room for the node."""
 
+SHOWN = 3
+"""Odd lines of a file that are told."""
 NODE_ID, LAST_NODE_ID = 1, 127
 """Of the drive that the file describes, where a value depends on it; the largest one."""
 LARGEST_BINARY32 = 3.4e38
@@ -122,6 +124,14 @@ def read_makers_objects(where: str) -> MakersObjects:
             hint="give the EDS or DCF of a drive",
         )
     return MakersObjects(label, rows, assumed)
+
+
+def oddities_of(where: str) -> list[str]:
+    """Return what is odd about an EDS or DCF, one line each, the first few; nothing of a table."""
+    path = Path(where)
+    found = () if FAMILY_MARK in where else parse_eds(read_bytes(path), "line", NODE_ID).warnings
+    told = [text.replace("line:", "line ", 1) for text in found[:SHOWN]]
+    return [*told, *([f"and {len(found) - SHOWN} more of that kind"] if len(found) > SHOWN else [])]
 
 
 def _of_eds(data: bytes, path: Path) -> Iterator[tuple[tuple[int, int], ObjectRow]]:
