@@ -134,6 +134,7 @@ def _lowered(
         if counts * limit.per_count >= found[1]:
             return found
         try:
+            node.put(limit.item, node.get(limit.item))  # what it refuses now could not be brought back
             _put(node, limit, counts)
         except SdoAbort as abort:
             refused.append(f"limit {limit} stays at what the drive holds ({abort.what}): this program looks instead")

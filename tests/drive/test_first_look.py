@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""What is looked at before a drive is moved: how fast it answers."""
+"""What is looked at before a drive is moved: how fast it answers, and what it would take back."""
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 
+from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import LOOKS, DriveNode
+from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.own_limits import lower_limits
 from pmsmtool.drive_maps.shipped_maps import load_family
-from pmsmtool.errors import DriveTimeout
+from pmsmtool.errors import DriveTimeout, SdoAbort
 from tests.drive.table_drive import node_of
 
 
@@ -25,3 +33,21 @@ def test_a_drive_that_answers_late_is_refused_at_once(
         with pytest.raises(DriveTimeout, match="450 ms on average and up to 900 ms") as caught:
             node.refuse_late()
         assert "nothing was energised" in caught.value.hint
+
+
+def test_a_limit_whose_own_value_the_drive_refuses_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """0x6073 held 1000, and its file allows 800: it was lowered, and could not be brought back (exit code 1)."""
+    limit, put = objects.MAX_CURRENT_PERMILLE, DriveNode.put
+
+    def within_800(self: DriveNode, item: DriveObject, value: float) -> None:
+        if item == limit and value > 800:
+            raise SdoAbort(0x06090031, item.index, item.sub, "value too high")
+        put(self, item, value)
+
+    held = {objects.RATED_CURRENT_MA: 4000, limit: 1000, objects.MAX_SPEED_RPM: 6000}
+    with node_of(held, load_family("cia402")) as (table, node):
+        monkeypatch.setattr(DriveNode, "put", within_800)
+        drive: Any = SimpleNamespace(node=node, commands_bounded_current=True, shows_apk=math.inf)
+        found = lower_limits(drive, Envelope(i_max_apk=3.0, speed_max_rad_s=100.0))
+        assert found.current is None and "stays at what the drive holds" in found.refused[0]
+        assert table.number(limit) == 1000
