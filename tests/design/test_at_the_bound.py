@@ -130,6 +130,16 @@ def test_what_the_voltage_just_holds_is_within_reach() -> None:
     assert share_above(np.array([1.0, 2.0, np.nan]), 2.0) == 0.0
 
 
+def test_gains_of_the_coefficient_diagram_method() -> None:
+    """(24)-(37): a1 = gamma/tau, a0 = gamma/tau^2 over the plant's gain, cos delta and -V_a cos delta."""
+    surface, tau, V_a, delta = polar.SurfaceMachine(0.5, 1e-3, 0.02, 4), 1e-3, 8.0, 0.3
+    found = polar.cdm_gains(surface, V_a, delta, 20.0, 1e-4, tau)
+    K_P, K_I = (polar.CDM_GAMMA / tau * 1e-3 - 0.5, polar.CDM_GAMMA / tau**2 * 1e-3)
+    gain = math.cos(delta)
+    assert (found.K_P21, found.K_I21) == pytest.approx((K_P / gain, K_I / gain), rel=ROUNDING)
+    assert (found.K_P12, found.K_I12) == pytest.approx((-K_P / (V_a * gain), -K_I / (V_a * gain)), rel=ROUNDING)
+
+
 def test_a_realisation_is_of_the_ratio_alone() -> None:
     found = companion(np.array([2.0, 4.0]), np.array([2.0, 1.0]))
     assert str(found) == str(companion(np.array([1.0, 2.0]), np.array([1.0, 0.5])))

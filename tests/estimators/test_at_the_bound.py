@@ -21,6 +21,7 @@ from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.noise import MINIMUM_SAMPLES, estimate_noise
 from pmsmtool.estimators.resistance import Copper, copper_of, resistance_warmed
 from pmsmtool.estimators.sensor_mismatch import LEAST, SURE, SensorMismatch
+from pmsmtool.estimators.shaft.inertia_ratio import regress
 from pmsmtool.estimators.shaft.motion import DECAY_MOST, _coast, _stops_after, positions
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import Estimate
@@ -125,6 +126,13 @@ def test_the_course_of_the_current_within_a_period() -> None:
     fresh = linkage_rows.corrected(speeds, 0.0, T, None, switched, 0.0)
     of_instant = [0.5 * w**2 * psi * T**2 * (a - 1.0 / 12.0) for a in (1.0 / 16.0, 1.0 / 4.0)]
     assert late.u_q - fresh.u_q == pytest.approx(w * (of_instant[0] - of_instant[1]), rel=1e-6)
+
+
+def test_columns_that_are_nearly_one_another_are_refused() -> None:
+    x = np.random.default_rng(2).normal(size=50)
+    with pytest.raises(IdentificationError, match="condition"):
+        regress([x, x + 1e-9 * x[::-1]], x, what="a and b", stage="x")
+    assert regress([x, x[::-1]], 2.0 * x, what="a and b", stage="x") == pytest.approx([2.0, 0.0], abs=ROUNDING)
 
 
 def test_a_current_that_rises() -> None:

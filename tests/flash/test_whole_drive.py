@@ -17,11 +17,12 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connect import connect
 from pmsmtool.cli.main import cli
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.port import Identity
 from pmsmtool.errors import ConfigError, Interrupted, Partial
 from pmsmtool.flash.download import Download
 from pmsmtool.flash.journal import JournalFolder, read_snapshot
 from pmsmtool.flash.restore import check_snapshot, old_marks, plan_restore
-from pmsmtool.flash.whole_drive import Listed, kept_objects, readdressed, take_whole_backup, whole_map
+from pmsmtool.flash.whole_drive import Listed, kept_objects, other_product, readdressed, take_whole_backup, whole_map
 from pmsmtool.sim.node.node import Node
 from tests.foreign.data_sheets import Row, epos4, write_eds
 from tests.simulated_bus import settle
@@ -188,6 +189,13 @@ def test_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert undone.exit_code == 0, undone.exception
     with connect("pmsmsim", spare) as connection:
         assert int.from_bytes(DriveNode(connection, 1).sdo.read(0x30A0, 1), "little") != CHANGED[0x30A0, 1]
+
+
+def test_a_file_that_names_no_maker_or_product_fits_every_drive(tmp_path: Path) -> None:
+    drive = Identity(5, 0xFB, 0x61500000, 1, 9, "drive", "", "", "")
+    for said, warning in (("", ""), ("ProductNumber=0x61500000\n", ""), ("ProductNumber=0x7\n", "is for product 0x7")):
+        (tmp_path / "some.eds").write_text(f"[DeviceInfo]\n{said}{OTHERS}")
+        assert warning in (told := other_product(str(tmp_path / "some.eds"), drive)) and bool(told) == bool(warning)
 
 
 def test_the_file_of_another_maker_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
