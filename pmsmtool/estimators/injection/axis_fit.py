@@ -51,6 +51,9 @@ NEGLIGIBLE_WEIGHT = 1e-6
 """Information weight below which a model does not count."""
 DECIDED = -2.0 * math.log(NEGLIGIBLE_WEIGHT)
 """Difference of information criteria that makes such a weight."""
+LEAST_R = 0.8
+"""Resistance beside eddy currents, of the loop's, below which they stand for something else: with 0.2 to 0.7 of it, and
+time constants of 13 periods, the ripple of a link put L 13 to 40 % off."""
 UNPHYSICAL = 1e9
 """Residual outside the region where the model is defined."""
 
@@ -316,9 +319,10 @@ def _average(
     rows = [(effects, fit, layout, scaled_covariance(fit.jacobian)[0]) for effects, (fit, layout) in tried.items()]
     rows = [row for row in rows if np.isfinite(row[3][0, 0]) and row[1].cost < UNPHYSICAL]
     # a rotor cannot push back: where the data alone decide, such a model fitted something else. A value that other
-    # experiments put near zero scatters to both sides of it, and is in every model. Nor do eddy currents drive
+    # experiments put near zero scatters to both sides of it, and is in every model. Eddy currents drive nothing
     firsts = [(row, row[2].responses(row[1].x)[0]) for row in rows]
     rows = [row for row, at in firsts if at.model.eddy_s >= 0.0 and (row[2].motion is not None or at.motion >= 0.0)]
+    rows = [row for row in rows if not row[0].eddy or row[1].x[1] > LEAST_R]
     if not rows:
         raise refuse("E_NOT_CONVERGED", "no model of the axis could be fitted", stage="inductance")
     weights = information_weights([_criterion(fit, layout, timing) for _, fit, layout, _ in rows])

@@ -191,8 +191,7 @@ def estimate_inductances(
     shots: dict[str, list[Shot]] = {}
     traces = {"d": d_shots, "q": q_shots}
     for axis, records in traces.items():
-        stage = f"inductance, {axis} axis"
-        found = (_shot(record, axis, inverter, U_dc_v, stage) for record in records)
+        found = (_shot(record, axis, inverter, U_dc_v, f"inductance, {axis} axis") for record in records)
         shots[axis] = sorted(found, key=lambda shot: shot.half_period)
     fits = _fitted(shots, noise.sigma_a, R_ohm, motion, instant)
     for axis, fit in fits.items():
@@ -273,9 +272,7 @@ def estimate_inductances(
         verdict=Verdict.WARN if dependent or any(v is Verdict.WARN for v, *_ in widen.values()) else Verdict.PASS,
         # the q axis was fitted with what the d axis says
         sampling=None if instant is None else instant.sampling(fits["q"].delay, fits["q"].lag_s),
-        samplings=()
-        if instant is None
-        else tuple((weight, instant.sampling(delay, lag)) for weight, delay, lag in fits["q"].places),
+        samplings=tuple((w, instant.sampling(delay, lag)) for w, delay, lag in fits["q"].places if instant is not None),
         apart_s=apart_s,
     )
 
