@@ -456,8 +456,8 @@ class _Learner:
         if first is not None and lag_s is None:  # what scales rest on
             most = BANDWIDTH_DOUBT * self.emf.share
             shares = (self.emf.share - most, self.emf.share + most)
-            ends = [fit_speed_loop(record, self.emf._replace(share=share), loop) for share in shares]
-            emf_std = emf_doubt(*ends, most)
+            low, high = (fit_speed_loop(record, self.emf._replace(share=share), loop) for share in shares)
+            emf_std = emf_doubt(low, high, most)
         margin = math.degrees(phase_margin_rad(loop.K_p_per_J, loop.K_i_per_J, loop.lag_s))
         self.say(
             f"{what}: K_p/J {loop.K_p_per_J:.4g} 1/s, K_i/K_p {loop.K_i_per_J / loop.K_p_per_J:.3g} 1/s, "
