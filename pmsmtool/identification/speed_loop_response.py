@@ -280,9 +280,7 @@ def _solve(model: _Model, first: Array, weights: Sequence[float]) -> Array:
     from scipy.optimize import least_squares
 
     bounds = model.bounds.items()
-    low, high = (
-        np.array([math.log(of[k]) if name in _LOGARITHMIC else of[k] for name, of in bounds]) for k in (0, 1)
-    )
+    low, high = (np.array([math.log(of[k]) if name in _LOGARITHMIC else of[k] for name, of in bounds]) for k in (0, 1))
     start = np.clip(first, low + 1e-9, high - 1e-9)
     found = least_squares(
         lambda p: _weighted(model, p, weights), start, bounds=(low, high), x_scale=_STEPS,
