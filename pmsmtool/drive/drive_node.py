@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -25,7 +26,7 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
-from pmsmtool.errors import BusError, DriveFault, DriveTimeout, SdoAbort
+from pmsmtool.errors import BusError, DriveFault, DriveTimeout, NotAvailable, SdoAbort
 from pmsmtool.plain_text import one_line
 
 STATE_TIMEOUT_S = 2.0
@@ -130,8 +131,22 @@ class DriveNode:
         return int(self.get(item))
 
     def put(self, item: DriveObject, value: float) -> None:
-        """Write a number; where the answer is lost it is read back."""
-        self.write_bytes(item.index, item.sub, self.typed(item).encode(value))
+        """Write a number; where the answer is lost it is read back.
+
+        Raises
+        ------
+        NotAvailable
+            The object is too narrow for it.
+        """
+        typed = self.typed(item)
+        try:
+            data = typed.encode(value)
+        except (struct.error, OverflowError) as error:
+            where = f"node {self.node}, 0x{item.index:04X}:{item.sub:02X}"
+            raise NotAvailable(
+                f"{value:.0f} does not fit into the object's {8 * typed.size} bits", where=where
+            ) from error
+        self.write_bytes(item.index, item.sub, data)
 
     def command(self, item: DriveObject, value: int, *, retry: Retry = Retry.REPEAT) -> None:
         """Write a command: nothing a restore would have to bring back."""

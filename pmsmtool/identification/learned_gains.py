@@ -56,6 +56,9 @@ EXPONENTS = {
 """How K_i follows the counts of the gain and of the integral part: parallel, and three series forms.
 
 The integral part leaves K_p alone, so that its effect is seen in K_i / K_p, which a fit knows better than K_i."""
+BETTER = 0.95
+"""Misfit of the current with the lag before the torque, over the one with it in the feedback, from which on it may lie
+there: 0.55 to 0.87 of three drives with current loops of 400 rad/s, 1.01 to 1.12 of four with 700 to 2200."""
 NO_DOUBT = (0.0, 0.0, 0.0)
 UNITS = {"gain": "N m s/rad", "value": "N m/rad", "rate": "1/s", "time": "s"}
 
@@ -98,15 +101,15 @@ class Observation:
         What was measured.
     current_share : float
         Largest current over the rated one.
-    emf_std : tuple of float
-        Standard deviation of K_p, K_i and K_i / K_p (relative) by the EMF's share, which is not known.
+    model_std : tuple of float
+        Standard deviation of K_p, K_i and K_i / K_p (relative) by the EMF's share and by where the loop's lag lies.
     """
 
     gain: float
     integral: float
     loop: SpeedLoop
     current_share: float = 1.0
-    emf_std: tuple[float, float, float] = NO_DOUBT
+    model_std: tuple[float, float, float] = NO_DOUBT
 
     @property
     def std(self) -> float:
@@ -174,6 +177,17 @@ def emf_doubt(one: SpeedLoop, other: SpeedLoop, most: float) -> tuple[float, flo
     return K_p, K_i, rate
 
 
+def lag_doubt(loop: SpeedLoop, forward: SpeedLoop) -> tuple[float, float, float]:
+    """Return half of what K_p, K_i and K_i / K_p differ by (relative) where the lag lies before the torque.
+
+    Nothing where the loop with the lag in its feedback explains the current as well: there the current loop is fast.
+    """
+    if forward.misfit > BETTER * loop.misfit:
+        return NO_DOUBT
+    K_p, K_i, rate = (0.5 * abs(a - b) for a, b in zip(_logs(loop), _logs(forward), strict=True))
+    return K_p, K_i, rate
+
+
 def _log(observation: Observation, which: int) -> float:
     return _logs(observation.loop)[which]
 
@@ -218,7 +232,7 @@ def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, ro
         return Learned(name, None, math.inf, None, "", why)
     logs = [_log(o, K_P) - math.log(o.gain) for o in (base[0], gain_changed, base[1])]
     mean, std = _of_all(logs[:-1], logs[-1])
-    std = math.hypot(std, MODEL_DOUBT[0], base[0].std, base[0].emf_std[K_P], rotor.J_std)
+    std = math.hypot(std, MODEL_DOUBT[0], base[0].std, base[0].model_std[K_P], rotor.J_std)
     scale, half = rotor.J_kgm2 * math.exp(mean), NORMAL_95 * std
     if half > WIDEST:
         return Learned(name, None, half, "value", UNITS["gain"], f"its interval of {100 * half:.0f} % is too wide")
@@ -267,8 +281,8 @@ def integral_scale(
         kept = _log(o, RATE if relative else K_I)
         logs.append((-kept if best == "time" else kept) - math.log(o.integral))
     mean, std = _of_all(logs[:-1], logs[-1])
-    emf_std = base[0].emf_std[RATE if relative else K_I]
-    half = NORMAL_95 * math.hypot(std, MODEL_DOUBT[1], base[0].std, emf_std, 0.0 if relative else rotor.J_std)
+    model_std = base[0].model_std[RATE if relative else K_I]
+    half = NORMAL_95 * math.hypot(std, MODEL_DOUBT[1], base[0].std, model_std, 0.0 if relative else rotor.J_std)
     if half > WIDEST:
         return unknown(f"its interval of {100 * half:.0f} % is too wide", best, half)
     scale = math.exp(mean) if relative else rotor.J_kgm2 * math.exp(mean)

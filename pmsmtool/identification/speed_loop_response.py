@@ -106,6 +106,8 @@ class SpeedLoop:
         Of the loop; from the write of a reference to its effect.
     amps_per_rad_s2 : float
         Shown current per acceleration: J over the torque per shown ampere.
+    misfit : float
+        Root mean square of what the loop leaves of the current, in its noise.
     """
 
     K_p_per_J: float
@@ -113,6 +115,7 @@ class SpeedLoop:
     lag_s: float
     late_s: float
     amps_per_rad_s2: float
+    misfit: float = 1.0
 
 
 def phase_margin_rad(K_p_per_J: float, K_i_per_J: float, lag_s: float) -> float:
@@ -132,8 +135,8 @@ def phase_margin_rad(K_p_per_J: float, K_i_per_J: float, lag_s: float) -> float:
 class _Model:
     """Answer of the loop to a record's references, for trial parameters."""
 
-    def __init__(self, record: StepRecord, emf: Emf, lag_s: float | None = None) -> None:
-        self.emf = emf
+    def __init__(self, record: StepRecord, emf: Emf, lag_s: float | None = None, forward: bool = False) -> None:
+        self.emf, self.forward = emf, forward
         self.bounds = BOUNDS if lag_s is None else {**BOUNDS, "lag": (lag_s / SAME, lag_s * SAME)}
         thin = max(1, len(record.t_s) // ENOUGH_SAMPLES)
         if thin > 1:
@@ -168,7 +171,8 @@ class _Model:
         open_loop = np.array([1.0, corner * (1.0 + self.emf.share), 0.0, 0.0])
         lag = np.poly1d([lag_s / STAGES, 1.0]) ** STAGES
         loop = np.polyadd(np.polymul(open_loop, lag.coeffs), numerator)
-        numerator = np.polymul(numerator, lag.coeffs)
+        if not self.forward:
+            numerator = np.polymul(numerator, lag.coeffs)
         poles = np.roots(loop).astype(np.complex128)
         poles *= 1.0 + 1e-7 * np.arange(len(poles))  # no two the same
         residues: NDArray[np.complex128] = np.polyval(numerator, poles) / np.polyval(np.polyder(loop), poles)
@@ -232,7 +236,12 @@ def _projected(parts: list[tuple[Array, Array, Array]], known: float | None = No
 
 
 def fit_speed_loop(
-    record: StepRecord, emf: Emf, first: SpeedLoop | None = None, lag_s: float | None = None
+    record: StepRecord,
+    emf: Emf,
+    first: SpeedLoop | None = None,
+    lag_s: float | None = None,
+    *,
+    forward: bool = False,
 ) -> SpeedLoop:
     """Return the speed loop that answers as the record does.
 
@@ -242,13 +251,15 @@ def fit_speed_loop(
         Of a similar record, to begin with.
     lag_s : float, optional
         The loop's lag where another record of the drive told it: a gain does not change it.
+    forward : bool
+        Whether it lies between the loop and the torque (a slow current loop), not in the speed that is fed back.
 
     Raises
     ------
     IdentificationError
         Too few samples, or no loop of this kind answers so.
     """
-    model = _Model(record, emf, lag_s)
+    model = _Model(record, emf, lag_s, forward)
     firsts = [model.start(a) for a in FIRST_BANDWIDTHS]
     if first is not None:
         known = [math.log(first.K_p_per_J), math.log(first.K_i_per_J), math.log(first.lag_s), first.late_s, 0.0]
@@ -258,7 +269,7 @@ def fit_speed_loop(
     parts = model.fitted(plain)[:2]
     weights = tuple(max(1.0, float(np.sqrt(np.mean(part**2)))) for part in parts)
     plain = _solve(model, plain, weights)
-    *_, amps, follows = model.fitted(plain)
+    _, left, amps, follows = model.fitted(plain)
     if not follows > FOLLOWS or amps == 0.0:
         raise IdentificationError(
             "E_EXCITATION",
@@ -266,7 +277,8 @@ def fit_speed_loop(
             likely="a locked shaft or a closed brake, or a speed loop that is not set up",
             hint="free the shaft; run the maker's own set-up first",
         )
-    return SpeedLoop(math.exp(plain[0]), math.exp(plain[1]), math.exp(plain[2]), float(plain[3]), amps)
+    K_p, K_i, lag = np.exp(plain[:3]).tolist()
+    return SpeedLoop(K_p, K_i, lag, float(plain[3]), amps, math.sqrt(float(np.mean(left**2))))
 
 
 def _weighted(model: _Model, p: Array, weights: Sequence[float]) -> Array:

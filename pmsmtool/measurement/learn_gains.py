@@ -26,7 +26,7 @@ from pmsmtool.drive_maps.drive_map import LETTERS
 from pmsmtool.errors import IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal, SdoAbort
 from pmsmtool.flash.gain_journal import GainJournal
 from pmsmtool.flash.journal import Entry
-from pmsmtool.identification.learned_gains import BANDWIDTH_DOUBT, NO_DOUBT, Observation, emf_doubt
+from pmsmtool.identification.learned_gains import BANDWIDTH_DOUBT, NO_DOUBT, Observation, emf_doubt, lag_doubt
 from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop, StepRecord, fit_speed_loop, phase_margin_rad
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Brake, Load, MachineParameters, Shaft
@@ -452,12 +452,14 @@ class _Learner:
         record = self._record(step)
         self.guard.stop()  # a fit takes longer than the drive waits for a heartbeat
         loop = fit_speed_loop(record, self.emf, first, lag_s)
-        emf_std = NO_DOUBT
+        model_std = NO_DOUBT
         if first is not None and lag_s is None:  # what scales rest on
             most = BANDWIDTH_DOUBT * self.emf.share
             shares = (self.emf.share - most, self.emf.share + most)
             low, high = (fit_speed_loop(record, self.emf._replace(share=share), loop) for share in shares)
-            emf_std = emf_doubt(low, high, most)
+            placed = lag_doubt(loop, fit_speed_loop(record, self.emf, loop, forward=True))
+            K_p, K_i, rate = map(math.hypot, emf_doubt(low, high, most), placed)
+            model_std = K_p, K_i, rate
         margin = math.degrees(phase_margin_rad(loop.K_p_per_J, loop.K_i_per_J, loop.lag_s))
         self.say(
             f"{what}: K_p/J {loop.K_p_per_J:.4g} 1/s, K_i/K_p {loop.K_i_per_J / loop.K_p_per_J:.3g} 1/s, "
@@ -465,7 +467,7 @@ class _Learner:
         )
         self.guard.enable()
         peak = float(np.abs(record.current_a).max())
-        return Observation(counts[GAIN], counts[INTEGRAL], loop, peak / self.drive.rated_apk, emf_std)
+        return Observation(counts[GAIN], counts[INTEGRAL], loop, peak / self.drive.rated_apk, model_std)
 
     def _changed(
         self,

@@ -196,7 +196,7 @@ def test_killed_with_a_changed_gain_the_next_connection_restores(
         raise KeyboardInterrupt
 
     loop = SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02)
-    monkeypatch.setattr(learn_gains, "fit_speed_loop", lambda *arguments: loop)
+    monkeypatch.setattr(learn_gains, "fit_speed_loop", lambda *arguments, **options: loop)
     monkeypatch.setattr(learn_gains, "LEAST_S", 0.6)
     monkeypatch.setattr(GuardedDrive, "change", cut)
     code, _, _ = bench.learn(tool)
@@ -217,7 +217,7 @@ def test_a_fit_waits_until_the_voltage_is_off(bench: Bench, tool: Tool, monkeypa
         guards.append(self)
         begin(self, **how)
 
-    def fit(*arguments: Any) -> SpeedLoop:
+    def fit(*arguments: Any, **options: Any) -> SpeedLoop:
         energised.append(guards[0]._drive.may_be_energised)
         return SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02)
 
@@ -240,7 +240,7 @@ def test_a_run_that_ends_with_an_error_leaves_no_journal(
         raise DriveFault("the drive left operation during a measurement")
 
     loop = SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02)
-    monkeypatch.setattr(learn_gains, "fit_speed_loop", lambda *arguments: loop)
+    monkeypatch.setattr(learn_gains, "fit_speed_loop", lambda *arguments, **options: loop)
     monkeypatch.setattr(learn_gains, "LEAST_S", 0.6)
     monkeypatch.setattr(GuardedDrive, "change", fails)
     code, _, said = bench.learn(tool)

@@ -19,7 +19,7 @@ from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.identity_rows import IdentityRows
 from pmsmtool.drive_maps.motion_objects import MotionObject
 from pmsmtool.drive_maps.shipped_maps import load_family
-from pmsmtool.errors import DriveFault, DriveTimeout, SdoAbort, StopNotConfirmed
+from pmsmtool.errors import DriveFault, DriveTimeout, NotAvailable, SdoAbort, StopNotConfirmed
 from tests.bus.scripted import NODE, ScriptedBus
 from tests.drive.table_drive import TableDrive, node_of
 
@@ -105,6 +105,17 @@ def test_the_period_of_its_heartbeat(ms: int | None, period_s: float | None) -> 
     with node_of({} if ms is None else {objects.PRODUCER_HEARTBEAT_MS: ms}) as (_, node):
         node.identity()
         assert node.supervision.heartbeat_period_s == period_s
+
+
+def test_a_number_wider_than_the_drive_keeps_it_is_named() -> None:
+    """`map learn` ended in a traceback (70) on a drive with 0x60FF of 16 bits."""
+    with node_of({}) as (table, node):
+        table.objects[0x60FF, 0] = bytes(2)
+        assert node.held(objects.TARGET_VELOCITY_MRPM) == 0.0
+        node.put(objects.TARGET_VELOCITY_MRPM, -32768)
+        with pytest.raises(NotAvailable, match="32768 does not fit into the object's 16 bits"):
+            node.put(objects.TARGET_VELOCITY_MRPM, 32768)
+        assert table.objects[0x60FF, 0] == b"\x00\x80"
 
 
 # ---- states ---------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from pmsmtool.identification.learned_gains import (
     emf_doubt,
     gain_scale,
     integral_scale,
+    lag_doubt,
 )
 from pmsmtool.identification.speed_loop_response import SpeedLoop
 
@@ -113,11 +114,21 @@ def test_what_the_emf_may_take_is_in_the_interval_that_it_moves() -> None:
     moved = emf_doubt(*ends, 0.1)
     assert moved == pytest.approx((0.074, 0.074, 0.0), abs=1e-3)
     assert emf_doubt(*ends, 0.05) == pytest.approx((0.05, 0.05, 0.0))
-    light = [replace(base[0], emf_std=moved), *base[1:]]
+    light = [replace(base[0], model_std=moved), *base[1:]]
     assert gain_scale(light, gain_changed, ROTOR, P).scale is None
     assert integral_scale(light, gain_changed, integral_changed, ROTOR, I).scale == pytest.approx(
         1.0 / RATE / INTEGRALS, rel=3e-3
     )
+
+
+def test_a_lag_that_may_lie_before_the_torque_is_in_the_interval() -> None:
+    """An EPOS2 with a current loop of 400 rad/s: K_p was told 10 % too small at +-7 %."""
+    base, gain_changed, _ = observed("time")
+    own, forward = replace(base[0].loop, misfit=7.5), loop(1.2 * A0, 1.2 * A0 * RATE)
+    doubt = lag_doubt(own, replace(forward, misfit=5.5))
+    assert doubt == pytest.approx((0.5 * math.log(1.2), 0.5 * math.log(1.2), 0.0), abs=1e-3)
+    assert gain_scale([replace(base[0], model_std=doubt), *base[1:]], gain_changed, ROTOR, P).scale is None
+    assert lag_doubt(own, replace(forward, misfit=7.4)) == (0.0, 0.0, 0.0), "a fast current loop explains as much"
 
 
 def test_a_small_current_leaves_gains_unknown() -> None:
