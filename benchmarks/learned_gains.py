@@ -42,7 +42,8 @@ from pmsmtool.flash.gain_journal import any_left, restore_left
 from pmsmtool.identification.learned_gains import Learned
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.temperature import magnet_flux_at
-from pmsmtool.measurement.learn_gains import GAIN, INTEGRAL, gain_object, learn_speed_loop, within_budget
+from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, gain_object
+from pmsmtool.measurement.learn_gains import learn_speed_loop, within_budget
 from pmsmtool.measurement.learn_position_gain import learn_position_gain, position_gain
 from pmsmtool.measurement.learned_rows import emf_of, learned_gains, shown_currents
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains

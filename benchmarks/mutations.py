@@ -9,9 +9,8 @@
 The mutations are drawn from the hash of the present commit, each with the same chance over all operators of the rooms:
 comparisons, arithmetic, ``and``/``or`` and ``not``, in Python by its syntax tree and in C by its tokens; the numbers
 of the Python sources are a draw of their own. Each is made in a copy of the commit, of which only the room's own tests
-run, and what they saw is compared with what was recorded (`tests/recorded_results.py`; `PMSMTOOL_RECORDED=` leaves
-that out). A mutation is caught when a test fails, when one needs more than ten times what it needs without it, or when
-the C does not compile.
+run. A mutation is caught when a test fails, when one needs more than ten times what it needs without it, or when the
+C does not compile.
 
 In Python the tests run once before with every drawn place watched: it computes both what is written and the mutation,
 and notes for each test whether they differ anywhere, in programs that the test starts as well. Only those tests run
@@ -367,7 +366,7 @@ def _built(folder: Path) -> bool:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    return {"PMSMTOOL_RECORDED": "compare", **os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    return {**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def main() -> None:

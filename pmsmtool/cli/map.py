@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
     from pmsmtool.identification.learned_gains import Learned
     from pmsmtool.machine.machine_file import MachineFile
-    from pmsmtool.measurement.learn_gains import GainObject, LearnedLoop
+    from pmsmtool.measurement.changed_gains import GainObject
+    from pmsmtool.measurement.learn_gains import LearnedLoop
 
 OBJECT = re.compile(r"0x([0-9A-Fa-f]{4})(?::0?x?([0-9A-Fa-f]{1,2}))?")
 NORMAL = 1.96
@@ -71,15 +72,8 @@ def learn_command(
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.map_gate import check_motion
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.measurement.learn_gains import (
-        GAIN,
-        INTEGRAL,
-        gain_address,
-        gain_object,
-        learn_speed_loop,
-        learning_envelope,
-        refuse_unsafe,
-    )
+    from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, gain_address, gain_object, refuse_unsafe
+    from pmsmtool.measurement.learn_gains import learn_speed_loop, learning_envelope
     from pmsmtool.measurement.learn_position_gain import POSITION, learn_position_gain, position_gain
     from pmsmtool.measurement.learned_rows import emf_of, learned_gains
 
@@ -128,7 +122,7 @@ def learn_command(
 def _addresses(names: tuple[str, ...]) -> dict[str, tuple[int, int] | None]:
     """Return the wanted names with their objects, None where none is given."""
     from pmsmtool.errors import ConfigError
-    from pmsmtool.measurement.learn_gains import STANDARD
+    from pmsmtool.measurement.changed_gains import STANDARD
     from pmsmtool.measurement.learn_position_gain import POSITION
 
     known = (*STANDARD, POSITION)

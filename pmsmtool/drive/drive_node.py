@@ -144,8 +144,10 @@ class DriveNode:
         except (struct.error, OverflowError) as error:
             where = f"node {self.node}, 0x{item.index:04X}:{item.sub:02X}"
             raise NotAvailable(
-                f"{value:.0f} does not fit into the object's {8 * typed.size} bits", where=where
-            ) from error
+                f"{value:.0f} does not fit into the object's {8 * typed.size} bits", where=where,
+                likely="a coarse unit of the drive's, or a shaft that does not follow and was asked for more and more",
+                hint="`pmsmtool check` looks at the shaft, `pmsmtool caps` at the units",
+            ) from error  # fmt: skip
         self.write_bytes(item.index, item.sub, data)
 
     def command(self, item: DriveObject, value: int, *, retry: Retry = Retry.REPEAT) -> None:

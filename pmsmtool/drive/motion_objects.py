@@ -300,7 +300,7 @@ def position_units(node: DriveNode) -> float:
 
 
 def unlike_stated(node: DriveNode) -> list[str]:
-    """Say where the number of a turn that the owner states in a map is not the drive's own; one line, or none."""
+    """Say where the position units of a turn that a map states are not the drive's own; one line, or none."""
     row = node.map.motion.get("counts_per_turn")
     try:
         own = _position_units(node) if row is not None and row.number else 0.0
@@ -409,7 +409,7 @@ def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, floa
 def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
     """Return the limits that the drive lacks, or holds far below its rated current, one line each with what to do.
 
-    A number of a turn that the map states otherwise is one of them.
+    Units of a turn that the map states otherwise than the drive's objects are told with them.
     """
     lines = unlike_stated(node)
     for limit in current_limits(node, rated):

@@ -175,5 +175,5 @@ def position_scale(
 def _refused(what: str, likely: str) -> IdentificationError:
     return IdentificationError(
         "E_EXCITATION", what, likely=likely or "an integral part of the position, or one controller of the position",
-        hint="the position gain stays unknown",
+        hint="where the drive's manual states the unit of the gain, write it into a map (--map FILE)",
     )  # fmt: skip

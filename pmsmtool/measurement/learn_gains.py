@@ -1,46 +1,37 @@
 # SPDX-License-Identifier: MIT
-"""``map learn``: change a gain of the connected drive by a known ratio, and see how its speed loop answers.
-
-The journal is on disk before the first change; every change happens with the voltage off; the first one is a step
-down. The drive holds its own gains again when this ends, and the next connection sees to it where this cannot.
-"""
+"""``map learn``, its first part: change a gain by a known ratio, and see how the drive's speed loop answers."""
 
 from __future__ import annotations
 
-import contextlib
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from pmsmtool.drive.drive_node import NOT_READ, DriveNode
 from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
-from pmsmtool.drive.guard import WATCH_S, GuardedDrive, guarded
+from pmsmtool.drive.guard import WATCH_S, GuardedDrive
 from pmsmtool.drive.motion_objects import allowed, speed_limits
-from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
-from pmsmtool.drive_maps.drive_map import LETTERS
-from pmsmtool.errors import IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal, SdoAbort
-from pmsmtool.flash.gain_journal import GainJournal
-from pmsmtool.flash.journal import Entry
+from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.identification.learned_gains import BANDWIDTH_DOUBT, NO_DOUBT, Observation, emf_doubt, lag_doubt
 from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop, StepRecord, fit_speed_loop, phase_margin_rad
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Brake, Load, MachineParameters, Shaft
+from pmsmtool.measurement.changed_gains import (
+    DOWN,
+    GAIN,
+    INTEGRAL,
+    GainObject,
+    Put,
+    changed_counts,
+    changing,
+    refuse_unsafe,
+)
 from pmsmtool.measurement.speed_unit import find_speed_unit
 from pmsmtool.units import rad_s_from_rpm
 
-GAIN, INTEGRAL = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"
-STANDARD = {GAIN: (0x60F9, 1), INTEGRAL: (0x60F9, 2)}
-"""Where CiA 402 puts the gains of the speed loop; what one count is worth it leaves to the maker."""
-ADDRESS = re.compile(r"0x([0-9A-F]{4}):([0-9A-F]{2})")
-HOLDS = re.compile(r" (?:has|holds) ")
-"""Reasons why a map leaves a gain out begin with its objects: "0x2331:01 or 0x60F9:01 has no unit ..."."""
-DOWN = 0.7
-"""First change of a gain."""
 INTEGRAL_DOWN, LITTLE_DOWN = 0.8, 0.9
 """First change of an integral part: where it is a time, its gain rises by 1.25, less where the margin needs it."""
 FURTHER_DOWN = 0.5
@@ -81,25 +72,7 @@ DURATION_S = 120.0
 SEEN_S = 2.0 * WATCH_S
 """A speed beyond its limit is seen and the voltage off within this time."""
 REST_S, REST_RAD = 0.3, 2e-3
-COARSEST = 0.12
-"""Largest deviation of a ratio in whole counts from the one wanted."""
 ROUNDING = 1.0 / math.sqrt(12.0)
-FLOATS_FROM = 0x20000000
-"""Whole number from which four bytes of unknown type are rather a REAL32: 0.7 of its bits would be another gain."""
-
-
-@dataclass(frozen=True, slots=True)
-class GainObject:
-    """Where the drive keeps a gain, and what it held before."""
-
-    name: str
-    item: DriveObject
-    counts: float
-
-    @property
-    def address(self) -> str:
-        """Index and sub-index."""
-        return f"0x{self.item.index:04X}:{self.item.sub:02X}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,114 +84,6 @@ class LearnedLoop:
     integral_changed: Sequence[Observation]
     speed_unit_rad_s: float
     notes: Sequence[str]
-
-
-def gain_address(node: DriveNode, name: str) -> tuple[int, int]:
-    """Return where a drive keeps a gain: by its map, by what the map says of a gain without unit, else by CiA 402.
-
-    Raises
-    ------
-    NotAvailable
-        The drive has none of these objects.
-    """
-    if name in node.map.cells:
-        return node.map.address(name)
-    told = named_addresses(node, name)
-    for address in (*told, STANDARD[name]):
-        if node.has(*address):
-            return address
-    known = " or ".join(f"0x{index:04X}:{sub:02X}" for index, sub in dict.fromkeys((*told, STANDARD[name])))
-    raise NotAvailable(
-        f"no object of this drive is known to hold {name}: it has no {known}", where=f"node {node.node}",
-        hint=f"where its manual names one: `pmsmtool map learn {name}=0xINDEX:SUB`",
-    )  # fmt: skip
-
-
-def named_addresses(node: DriveNode, name: str) -> list[tuple[int, int]]:
-    """Return the objects that the map of a drive names for a gain whose unit nobody publishes."""
-    places = ADDRESS.findall(HOLDS.split(node.map.left_out.get(name, ""))[0])
-    return [(int(index, 16), int(sub, 16)) for index, sub in places]
-
-
-def gain_object(node: DriveNode, name: str, index: int, sub: int) -> GainObject:
-    """Return the object of a gain, its type by the map, else by its size.
-
-    Raises
-    ------
-    NotAvailable
-        The drive has no such object, or its type is not known, or it is too small to be changed by a known ratio.
-    """
-    cell = node.map.cells.get(name)
-    wire = LETTERS[cell.wire] if cell is not None and (cell.index, cell.sub) == (index, sub) else None
-    where = f"node {node.node}, 0x{index:04X}:{sub:02X}"
-    try:
-        data = node.sdo.read(index, sub)
-    except SdoAbort as abort:
-        if abort.code not in NOT_READ:
-            raise
-        raise NotAvailable(
-            f"{name}: the drive has no such object", where=where,
-            hint=f"name the one that its manual calls this gain: `pmsmtool map learn {name}=0xINDEX:SUB`",
-        ) from abort  # fmt: skip
-    letter = wire or {1: "B", 2: "H", 4: "I"}.get(len(data), "")
-    if not letter or DriveObject(index, sub, letter).size != len(data):
-        raise NotAvailable(f"{name}: {len(data)} bytes are no number that this program changes", where=where)
-    item = DriveObject(index, sub, letter)
-    held = item.decode(data)
-    if wire is None and held >= FLOATS_FROM:
-        raise NotAvailable(
-            f"{name}: its bytes {data.hex()} may be a whole number or a REAL32", where=where,
-            hint="give the object with its type in a map: --map FILE",
-        )  # fmt: skip
-    found = GainObject(name, item, held)
-    changed_counts(found, DOWN)
-    return found
-
-
-def changed_counts(gain: GainObject, ratio: float) -> float:
-    """Return counts in about a ratio to those held: whole ones, but of a REAL32.
-
-    Raises
-    ------
-    NotAvailable
-        Whole counts are too coarse for it, or it holds no gain.
-    """
-    counts = gain.counts * ratio
-    if gain.item.letter == "f":
-        counts = gain.item.decode(gain.item.encode(counts))
-    else:
-        signed = (1 << 8 * gain.item.size - 1) - 1
-        counts = round(counts)
-        if gain.counts <= signed:  # nothing says whether the object has a sign
-            counts = min(counts, signed)
-    if not 0.0 < gain.counts < math.inf or not 1.0 - COARSEST < counts / (gain.counts * ratio) < 1.0 + COARSEST:
-        raise NotAvailable(
-            f"{gain.name} holds {gain.counts:.9g}: it cannot be changed by {ratio:g}", where=gain.address
-        )
-    return counts
-
-
-def refuse_unsafe(node: DriveNode, envelope: Envelope) -> None:
-    """Refuse what rules out a change of gains: a drive that saves by itself, a coupled shaft, gravity, a turning shaft.
-
-    Raises
-    ------
-    SafetyRefusal
-        With what it is.
-    """
-    if envelope.shaft != "free" or envelope.load != "none":
-        raise SafetyRefusal(
-            f"gains are changed only with a free shaft and no load; given are shaft {envelope.shaft}, load "
-            f"{envelope.load}",
-            where=f"node {node.node}", hint="uncouple the machine, then give --shaft free",
-        )  # fmt: skip
-    for sub in (1, 2, 3):
-        word = node.held(DriveObject(0x1010, sub, "I"))
-        if word is not None and int(word) & 2:
-            raise SafetyRefusal(
-                "the drive stores parameters by itself: a changed gain would survive", hint="learn it on another drive",
-                where=f"node {node.node}, 0x1010:{sub:02X} = {int(word):#x}",
-            )  # fmt: skip
 
 
 def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: float, speed_max_rad_s: float) -> float:
@@ -281,26 +146,15 @@ def learn_speed_loop(
     NotAvailable
         The drive does not follow its velocity mode, or a gain cannot be changed.
     """
-    node = drive.node
-    refuse_unsafe(node, envelope)
+    refuse_unsafe(drive.node, envelope)
     _refuse_turning(drive)
-    entries = [Entry(g.name, g.item.index, g.item.sub, g.item.encode(g.counts)) for g in (gain, integral)]
-    journal = GainJournal(drive.identity, entries)
-    journal.begin()
-    try:
-        with guarded(drive, envelope, say=say) as guard:
-            drive.send_samples()
-            try:
-                found = _Learner(guard, drive, journal, emf, say).run(gain, integral)
-            finally:
-                guard.stop()
-                drive.end_samples()
-    except PmsmtoolError:
-        with contextlib.suppress(PmsmtoolError):  # what is not back stays in the journal
-            journal.end(node)
-        raise
-    journal.end(node)
-    return found
+    with changing(drive, (gain, integral), envelope, say) as (guard, put):
+        drive.send_samples()
+        try:
+            return _Learner(guard, drive, put, emf, say).run(gain, integral)
+        finally:
+            guard.stop()
+            drive.end_samples()
 
 
 def _margin(own: SpeedLoop, worst: tuple[float, float]) -> float:
@@ -353,11 +207,11 @@ class _Learner:
         self,
         guard: GuardedDrive,
         drive: SpeedLoopDrive,
-        journal: GainJournal,
+        put: Put,
         emf: Emf,
         say: Callable[[str], None],
     ) -> None:
-        self.guard, self.drive, self.journal, self.emf, self.say = guard, drive, journal, emf, say
+        self.guard, self.drive, self.put, self.emf, self.say = guard, drive, put, emf, say
         limit = guard.envelope.speed_max_rad_s
         self.low, self.span = LOW_SHARE * limit, (HIGH_SHARE - LOW_SHARE) * limit
         self.bandwidth, self.hold_s, self.settle_s = FIRST_BANDWIDTH, HOLD_TIMES / FIRST_BANDWIDTH, SETTLE_S
@@ -496,7 +350,7 @@ class _Learner:
             )
             return None
         try:
-            self._put(gain, new)
+            self.put(gain, new)
         except SdoAbort as abort:
             self.notes.append(f"{gain.name}: the drive does not take {new:.9g}: {abort.what}")
             self.guard.enable()
@@ -508,12 +362,6 @@ class _Learner:
             found = self._observe(what, step, {**counts, gain.name: new}, own, own.lag_s)
         except IdentificationError as error:
             self.notes.append(f"{gain.name}: {error.what}")
-        self._put(gain, gain.counts)  # after anything else the guard does it, and nothing is enabled again
+        self.put(gain, gain.counts)  # after anything else the guard does it, and nothing is enabled again
         self.guard.enable()
         return found
-
-    def _put(self, gain: GainObject, counts: float) -> None:
-        data = gain.item.encode(counts)
-        self.guard.stop()
-        self.journal.note(gain.item.index, gain.item.sub, data)
-        self.guard.change(gain.item, data)

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: MIT
 """``map learn``, its second part: moves at even speed with the drive's own position gain, and with 0.7 of it.
 
-As for the speed loop: the journal is on disk before the first change, every change happens with the voltage off, and
-the only change of the gain is a step down. The feed-forward of the speed is 0 meanwhile, where it has an object.
+The only change of the gain is a step down. The feed-forward of the speed is 0 meanwhile, where it has an object.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,18 +13,16 @@ from dataclasses import replace
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
-from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.position_drive import PositionDrive
-from pmsmtool.errors import IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal
+from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal
 from pmsmtool.experiments.move import record_move
-from pmsmtool.flash.gain_journal import GainJournal
-from pmsmtool.flash.journal import Entry
 from pmsmtool.identification.learned_gains import Learned
 from pmsmtool.identification.position_lag import PositionLag, position_lag, position_scale
-from pmsmtool.measurement.learn_gains import (
+from pmsmtool.measurement.changed_gains import (
     DOWN,
     GainObject,
     changed_counts,
+    changing,
     gain_object,
     named_addresses,
     refuse_unsafe,
@@ -60,10 +56,12 @@ def learn_position_gain(
 ) -> Learned:
     """Return what one count of the position gain is worth, or why that stays unknown; the drive is as before.
 
+    What was learned of other gains stays, also where a limit of the motion stopped the shaft: that is the reason then.
+
     Raises
     ------
-    LimitExceeded, DriveTimeout
-        The shaft did not follow: the voltage is off and the gains are back.
+    DriveTimeout, DriveFault
+        The drive no longer does as it is told: the voltage is off and the gains are back.
     """
     try:
         drive = PositionDrive(connection, node.node, drive_map=node.map)
@@ -71,8 +69,9 @@ def learn_position_gain(
             return _moved(drive, gain, envelope, say)
         finally:
             drive.close()
-    except (IdentificationError, NotAvailable, SafetyRefusal) as error:  # what was learned before stays
-        return Learned(POSITION, None, math.inf, None, "", error.what.partition("\n")[0])
+    except (IdentificationError, NotAvailable, SafetyRefusal) as error:
+        likely = f" (likely: {error.likely})" if error.likely else ""
+        return Learned(POSITION, None, math.inf, None, "", error.what.partition("\n")[0] + likely)
 
 
 def _moved(drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Callable[[str], None]) -> Learned:
@@ -81,36 +80,20 @@ def _moved(drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Call
     refuse_unsafe(node, envelope)
     forward, forward_is_zero = _fed_forward(node)
     written = [gain] if forward is None else [gain, forward]
-    journal = GainJournal(
-        drive.identity, [Entry(g.name, g.item.index, g.item.sub, g.item.encode(g.counts)) for g in written]
-    )
     drive.error_limit_rad = BEHIND * WAY_RAD
-    journal.begin()
-    try:
-        with guarded(drive, replace(envelope, travel_rad=TRAVEL * WAY_RAD), say=say) as guard:
-
-            def put(item: GainObject, counts: float) -> None:
-                data = item.item.encode(counts)
-                journal.note(item.item.index, item.item.sub, data)
-                guard.change(item.item, data)
-
-            if forward is not None:
-                put(forward, 0)
-            record_move(guard, drive, SHORT_RAD, REST_S, find=(SPEED_RAD_S, SPEED_RAD_S / RAMP_S))
-            lags: list[tuple[float, PositionLag]] = []
-            for counts in (gain.counts, changed_counts(gain, DOWN)):
-                if lags:
-                    put(gain, counts)
-                trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
-                lags.append((counts, position_lag(trace, drive.rad_per_count)))
-                say(f"{gain.address} = {counts:.9g}: speed over lag {lags[-1][1].gain_per_s:.4g} 1/s")
-            for item in written:
-                put(item, item.counts)
-    except PmsmtoolError:
-        with contextlib.suppress(PmsmtoolError):  # what is not back stays in the journal
-            journal.end(node)
-        raise
-    journal.end(node)
+    lags: list[tuple[float, PositionLag]] = []
+    with changing(drive, written, replace(envelope, travel_rad=TRAVEL * WAY_RAD), say) as (guard, put):
+        if forward is not None:
+            put(forward, 0.0)
+        record_move(guard, drive, SHORT_RAD, REST_S, find=(SPEED_RAD_S, SPEED_RAD_S / RAMP_S))
+        for counts in (gain.counts, changed_counts(gain, DOWN)):
+            if lags:
+                put(gain, counts)
+            trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
+            lags.append((counts, position_lag(trace, drive.rad_per_count)))
+            say(f"{gain.address} = {counts:.9g}: speed over lag {lags[-1][1].gain_per_s:.4g} 1/s")
+        for item in written:
+            put(item, item.counts)
     return position_scale(lags[0], lags[1], POSITION, forward_is_zero=forward_is_zero)
 
 

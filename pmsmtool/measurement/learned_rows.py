@@ -13,7 +13,8 @@ from pmsmtool.identification.learned_gains import Convention, Learned, Rotor, co
 from pmsmtool.identification.speed_loop_response import Emf
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.measurement.learn_gains import GAIN, INTEGRAL, GainObject, LearnedLoop
+from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, GainObject
+from pmsmtool.measurement.learn_gains import LearnedLoop
 
 J_STD = 0.1
 """Standard deviation of an inertia without one (relative): a data sheet's is true to 20 %."""

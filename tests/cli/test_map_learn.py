@@ -25,7 +25,7 @@ from pmsmtool.flash.gain_journal import any_left
 from pmsmtool.identification.speed_loop_response import SpeedLoop
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
-from pmsmtool.measurement import learn_gains, learn_position_gain
+from pmsmtool.measurement import changed_gains, learn_gains, learn_position_gain
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.node.node import Node
@@ -266,7 +266,7 @@ def test_a_gain_is_changed_only_while_the_voltage_is_off(bench: Bench) -> None:
     before = bench.counts()
     with connect("pmsmsim", bench.channel) as connection:
         drive = SpeedLoopDrive(connection, 1, drive_map=load_family("cia402"))
-        gain = learn_gains.gain_object(drive.node, GAIN, *bench.drawn.gain)
+        gain = changed_gains.gain_object(drive.node, GAIN, *bench.drawn.gain)
         data = gain.item.encode(gain.counts - 100)
         with guarded(drive, Envelope(6.0, 50.0)) as guard:
             guard.enable()

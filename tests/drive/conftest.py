@@ -10,9 +10,6 @@ from pathlib import Path
 import pytest
 
 from tests.drive.recorder_rig import KINDS, Opener, Rig, rig_of
-from tests.recorded_results import pytest_runtest_makereport, recorded
-
-__all__ = ["opened", "pytest_runtest_makereport", "recorded"]
 
 
 @pytest.fixture(params=KINDS)

@@ -8,7 +8,7 @@ import pytest
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import NotAvailable
-from pmsmtool.measurement.learn_gains import DOWN, GAIN, INTEGRAL, changed_counts, gain_address, gain_object
+from pmsmtool.measurement.changed_gains import DOWN, GAIN, INTEGRAL, changed_counts, gain_address, gain_object
 from tests.drive.table_drive import node_of
 
 
