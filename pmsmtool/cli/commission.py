@@ -182,6 +182,7 @@ def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDr
 
     with bus.connect() as connection:
         node = DriveNode(connection, claimed_node(connection, bus.node))
+        node.refuse_late()
         found = examine(node, given)
         node.close()
         drive = open_for_level(connection, node.node, found)

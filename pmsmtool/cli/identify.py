@@ -187,6 +187,7 @@ def _choose(
     from pmsmtool.measurement.capabilities import MEASURING, examine, with_supply
 
     with open_node(bus) as node:
+        node.refuse_late()
         found = examine(node, None if map_file is None else read_map(map_file))
     if supply:
         found = with_supply(found)

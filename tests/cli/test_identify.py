@@ -48,6 +48,14 @@ def profile(name: str, **simulation: Any) -> str:
     return "drive.toml?nv=drive.nv"
 
 
+@pytest.mark.parametrize("command", ["check", "identify", "commission"])
+def test_a_drive_that_answers_late_is_refused_before_its_objects_are_read(command: str, tool: Tool) -> None:
+    Path("late.toml").write_text('[[frame]]\naction = "delay"\ndelay_s = 0.45\nids = "0x581"\n')
+    code, out, err = tool(command, "-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&faults=late.toml", "--yes")
+    assert (code, out) == (3, "") and "the drive answers late" in err, err
+    assert not Path("runs").exists()
+
+
 @pytest.mark.chain
 def test_the_truth_is_found_the_drive_is_as_before_and_the_replay_gives_the_same_bytes(tool: Tool) -> None:
     channel = profile("jercic-2017", inverter_model="switched")
