@@ -15,14 +15,17 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import WallClock
 from pmsmtool.bus.connect import Connection
 from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE
-from pmsmtool.cia402 import AbortConnection, State
-from pmsmtool.drive.dead_man import CONSUMER_MS, TRIES, prove_dead_man
+from pmsmtool.cia402 import AbortConnection, FaultReaction, State
+from pmsmtool.drive import objects
+from pmsmtool.drive.dead_man import CONSUMER_MS, TRIES, DeadManProof, _fault_without_ramp, prove_dead_man
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import BusError, SafetyRefusal
 from pmsmtool.sim.node.dictionary import Refused
 from tests.bus.scripted import ScriptedBus, ScriptedSlave
 from tests.drive.bench import ENVELOPE, SimBench, sim_bench
+from tests.drive.table_drive import node_of
 
 
 @pytest.fixture
@@ -83,6 +86,21 @@ def test_the_proof_itself_stops_what_it_has_enabled(bench: SimBench) -> None:
         bench.session.consumer.heard = lambda node: None  # type: ignore[method-assign]
         prove_dead_man(bench.drive, heartbeat)
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
+def test_what_a_person_reads_of_a_proof() -> None:
+    proof = DeadManProof(0.25, 0.105, AbortConnection.FAULT, 2, State.SWITCH_ON_DISABLED, by="node guarding")
+    assert str(proof) == (
+        "supervision tested: node guarding stopped, voltage off after 105 ms (declared 250 ms), to SWITCH ON DISABLED"
+    )
+
+
+@pytest.mark.parametrize(("held", "written"), [(FaultReaction.DISABLE, 0), (FaultReaction.SLOW_DOWN, 1)])
+def test_a_fault_removes_the_voltage_at_once(held: FaultReaction, written: int) -> None:
+    with node_of({objects.FAULT_REACTION: held}, load_family("cia402")) as (table, node):
+        _fault_without_ramp(node)
+        assert node.whole(objects.FAULT_REACTION) == FaultReaction.DISABLE
+        assert len(table.written(objects.FAULT_REACTION)) == written
 
 
 def stalling(bench: SimBench, monkeypatch: pytest.MonkeyPatch, stalls: int) -> list[float]:

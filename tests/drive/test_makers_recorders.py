@@ -6,6 +6,8 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -86,6 +88,26 @@ def _ran_on(rig: Rig) -> None:
     stops = (b"\0\0", b"\xfe\xff")
     entry.sink = lambda data: None if data in stops else sink(data)
     told.source = lambda: bytes([source()[0] & 0xFE, 0])
+
+
+@pytest.mark.parametrize(("counted", "runs"), [(11, False), (10, True)])
+@pytest.mark.parametrize("opened", ["rows"], indirect=True)
+def test_a_trace_that_counts_or_says_that_it_runs_after_it_was_read_is_refused(
+    commanded: Rig, monkeypatch: pytest.MonkeyPatch, counted: int, runs: bool
+) -> None:
+    commanded.recorder.arm(commanded.kind.signals, 10, 1, 0, at_excitation=False)
+    commanded.node.connection.wait(20 * T_S)
+    shown = {copley_objects.RECORDED: 10, copley_objects.LARGEST: 20, copley_objects.STATUS: 0}
+    rows = bytes(10 * len(commanded.kind.signals) * copley_objects.NUMBER_BYTES)
+
+    def upload(*_: Any, **__: Any) -> SimpleNamespace:
+        shown.update({copley_objects.RECORDED: counted, copley_objects.STATUS: copley_objects.RUNNING_BIT * runs})
+        return SimpleNamespace(data=rows)
+
+    monkeypatch.setattr(commanded.recorder, "_get", lambda item: shown[item])
+    monkeypatch.setattr(commanded.node.sdo, "upload", upload)
+    with pytest.raises(VerifyMismatch, match="ran on while it was read"):
+        commanded.recorder.fetch(commanded.kind.signals, 1)
 
 
 @COUNTED_ONCE

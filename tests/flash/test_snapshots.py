@@ -3,6 +3,8 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -10,18 +12,20 @@ from pmsmtool.cli.main import run
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.eds import Eds, EdsObject
 from pmsmtool.drive_maps.shipped_maps import load_family
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, SafetyRefusal
 from pmsmtool.flash.journal import (
     DamagedSnapshot,
     Entry,
     JournalFolder,
     Snapshot,
+    State,
     check_sum,
     parse_snapshot,
     read_snapshot,
     write_snapshot,
 )
-from pmsmtool.flash.restore import check_snapshot, take_backup
+from pmsmtool.flash.plan import Change, Plan
+from pmsmtool.flash.restore import check_snapshot, due_of_journal, take_backup
 from pmsmtool.flash.whole_drive import _stated_vendor
 from pmsmtool.params.catalogue import layout_signature
 from tests.flash.rig import SMALL, open_rig
@@ -177,3 +181,27 @@ def test_a_spare_part_is_compared_when_that_is_asked_for(tmp_path, monkeypatch, 
     assert "--other-drive" in capsys.readouterr().err
     assert run([*BUS, "verify", "b.json", "--other-drive"]) == 1
     assert "restore --other-drive b.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("state", "preparing", "holds", "due"),
+    [
+        ("open", False, b"other", 1),
+        ("done", False, b"efgh", 1),
+        ("done", True, b"other", 0),
+        ("done", False, b"other", None),
+        ("restored", False, b"efgh", None),
+    ],
+)
+def test_a_journal_is_due_where_the_drive_holds_what_it_wrote(
+    state: State, preparing: bool, holds: bytes, due: int | None
+) -> None:
+    entry = SNAPSHOT.entries[0]
+    change = Change(entry.name, entry.index, entry.sub, holds, entry.old, 0.5, 0.4, 0.4, "ohm")
+    folder: Any = SimpleNamespace(was_preparing=preparing, path="journal")
+    plan = Plan((change,), {}, "")
+    if due is None:
+        with pytest.raises(SafetyRefusal, match="neither its old nor its new set"):
+            due_of_journal(SNAPSHOT.with_state(state), plan, folder)
+    else:
+        assert len(due_of_journal(SNAPSHOT.with_state(state), plan, folder).entries) == due

@@ -22,7 +22,15 @@ from pmsmtool.errors import ConfigError, Interrupted, Partial
 from pmsmtool.flash.download import Download
 from pmsmtool.flash.journal import JournalFolder, read_snapshot
 from pmsmtool.flash.restore import check_snapshot, old_marks, plan_restore
-from pmsmtool.flash.whole_drive import Listed, kept_objects, other_product, readdressed, take_whole_backup, whole_map
+from pmsmtool.flash.whole_drive import (
+    Listed,
+    WholeDrive,
+    kept_objects,
+    other_product,
+    readdressed,
+    take_whole_backup,
+    whole_map,
+)
 from pmsmtool.sim.node.node import Node
 from tests.foreign.data_sheets import Row, epos4, write_eds
 from tests.simulated_bus import settle
@@ -117,6 +125,25 @@ def test_a_refused_object_is_named_and_takes_nothing_along(tmp_path: Path) -> No
             assert equal == (entry.name not in outcome.refused), entry.name
         journal = JournalFolder(node.identity(), tmp_path).last()
         assert journal is not None and journal.state == "done"
+
+
+def test_what_is_never_taken_is_written_twice_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second time, for what stood in its way may be gone; a third one would find nothing new."""
+    rounds: list[tuple[str, ...]] = []
+    inner = WholeDrive._write_in_order
+    monkeypatch.setattr(
+        WholeDrive, "_write_in_order", lambda self, due, wanted: (rounds.append(tuple(due)), inner(self, due, wanted))
+    )
+    path = write_eds(tmp_path / "x.eds", ROWS)
+    for refused, times in (((), 1), (((0x6080, 0),), 2)):
+        rounds.clear()
+        with opened(path) as node:
+            write(node, CHANGED)
+            saved, _ = take_whole_backup(node, node.identity(), listed())
+        with opened(path, "mtpv-test") as node:
+            refuse(node, *refused)
+            job(node, saved, tmp_path).run()
+        assert len(rounds) == times and len(rounds[-1]) == (len(refused) or len(rounds[0]))
 
 
 @pytest.mark.parametrize("at", [3, 8, 12])
