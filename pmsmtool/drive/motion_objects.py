@@ -49,6 +49,10 @@ MOST_RATED_MA = 1e7
 """Largest rated current of a motor (mA). 0 and 0xFFFFFFFF are drives without a motor's data; a REAL32 reads as 1e9."""
 SAME_UNITS = 1e-6
 """Two statements of the units of a turn, whole numbers and ratios of them, that differ by less are one."""
+RANGE_LIMIT = DriveObject(0x607B, 1, "i"), DriveObject(0x607B, 2, "i")
+"""Ends of the position, behind which it begins again; both 0: those of its type (CiA 402-2)."""
+LEAST_TURNS = 16
+"""Fewest turns between these ends: half of them within the 50 ms between two looks at the speed is 1000 rad/s."""
 LEAST_UNITS = 24
 """Fewest units of position per turn: one within the 50 ms between two looks at the speed is 5 rad/s then. Files of
 makers say 1 where nothing was set up."""
@@ -297,6 +301,28 @@ def position_units(node: DriveNode) -> float:
         if row is None or not row.number:
             raise
     return sign * _fine_enough(node, row.number)
+
+
+def position_turns(node: DriveNode, units: float) -> float:
+    """Return after how many turns of so many units the position begins again.
+
+    Raises
+    ------
+    NotAvailable
+        After so few that the speed seen between two looks could be a wrong one.
+    """
+    size = 8 * node.typed(POSITION).size
+    least, most = (node.held(item) or 0.0 for item in RANGE_LIMIT)
+    limited = most > least
+    turns = (most - least + 1.0 if limited else 2.0**size) / abs(units) if units else math.inf
+    if turns < LEAST_TURNS:
+        raise NotAvailable(
+            f"the position begins again after {turns:.3g} turns, {LEAST_TURNS} are needed to see a speed",
+            where=f"node {node.node}, {'0x607B' if limited else '0x6064'}",
+            likely="a rotary axis whose position is kept within a turn" if limited else f"a position of {size} bits",
+            hint="set both ends of 0x607B to 0, or to all of its type, with the maker's software",
+        )
+    return turns
 
 
 def unlike_stated(node: DriveNode) -> list[str]:

@@ -23,6 +23,7 @@ from pmsmtool.drive.motion_objects import (
     POSITION,
     TorqueTarget,
     cyclic_period_s,
+    position_turns,
     position_units,
     quicken_slope,
     rated_apk,
@@ -81,6 +82,7 @@ class StandardDrive(CanopenDrive):
         self._since: tuple[float, float] = (0.0, 0.0)  # counts, and the instant (s) before they were asked for
         self._speed_rad_s = 0.0
         self.counts_per_turn = position_units(self.node)
+        position_turns(self.node, self.counts_per_turn)
         self._rated_apk = rated_apk(self.node)
         self._current = shown_current(self.node, self._rated_apk)
         bits = 8 * self.node.typed(self._current.item).size

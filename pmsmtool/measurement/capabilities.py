@@ -18,8 +18,10 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.heartbeat import expects_pdos
 from pmsmtool.drive.mapped_recorder_drive import records_pushes
 from pmsmtool.drive.motion_objects import (
+    LEAST_TURNS,
     NO_RATED,
     limited_speed,
+    position_turns,
     position_units,
     rated_apk,
     shown_current,
@@ -70,6 +72,7 @@ FEATURES: Mapping[str, str] = {
     "push": "torque mode (0x6502 bit 3 or 9), or a velocity mode whose unit a map states, with a current limit",
     "position": "position in units of a known number per turn (0x6064 with 0x608F, no gear or factor in 0x6091 and "
     "0x6093, or in a map: an object, or a number)",
+    "range": f"a position of {LEAST_TURNS} turns or more before it begins again (32 bits in 0x6064, and 0x607B)",
     "encoder": "an encoder: between two edges of Hall sensors (hall.commutation) the angle is not measured",
     "frame": "a frame that turns with the rotor: not six steps (hall.commutation 3; 2 for this time)",
     "commutation angle": "mode 11 with commutation angle (0x6502 bit 10, 0x60EA)",
@@ -93,9 +96,11 @@ _ON_PLATE = {"rated current": "rated_current", "position": "counts_per_turn"}
 _TURNING = (*_INJECT, "frame")
 _ANGLE = (*_TURNING, "encoder")
 """What every sample of the angle is needed for."""
-_STANDARD = (*_BOUNDED, "position", "commutation angle")
-_PUSH = (*_BOUNDED, "push", "position", "current")
-_WATCHED = (*_SAFE, "position", "current")
+_SEEN = ("position", "range")
+"""What shows the speed."""
+_STANDARD = (*_BOUNDED, *_SEEN, "commutation angle")
+_PUSH = (*_BOUNDED, "push", *_SEEN, "current")
+_WATCHED = (*_SAFE, *_SEEN, "current")
 """What the guard needs while the drive runs by itself."""
 
 
@@ -261,7 +266,7 @@ class Capabilities:
     @property
     def by_moves(self) -> str:
         """What leads on where a drive is not pushed, but moves by its position loop; else empty."""
-        moves = self.features >= {*_BOUNDED, "position", "profile position"} and "push" not in self.features
+        moves = self.features >= {*_BOUNDED, *_SEEN, "profile position"} and "push" not in self.features
         return "; `pmsmtool move --identify` finds inertia and friction by moves" if moves else ""
 
     @property
@@ -326,7 +331,7 @@ _LEVELS = (
     (CapabilityLevel.FULL, (*_INJECT, "averages")),
     (CapabilityLevel.INJECT, _INJECT),
     (CapabilityLevel.RECORDER, _RECORD),
-    (CapabilityLevel.STANDARD, (*_BOUNDED, "push", "position")),
+    (CapabilityLevel.STANDARD, (*_BOUNDED, "push", *_SEEN)),
 )
 
 
@@ -375,6 +380,7 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
         torque = bool(modes & (_bit(Mode.PROFILE_TORQUE) | _bit(Mode.CYCLIC_TORQUE))) and node.has(0x6071, 0)
         has |= {
             "position": node.has(0x6064, 0) and node.has(0x608F, 1),
+            "range": True,
             "current": node.has(0x6078, 0),
             "torque mode": torque,
             "push": torque,
@@ -401,9 +407,11 @@ def _motion(node: DriveNode, rated: float | None) -> dict[str, bool]:
     """Ask a drive of another maker for what motion needs: the standard's objects, else those its map names."""
     base = rated or 1.0
     torque = _told(lambda: torque_target(node, base)) is not None
+    units = _told(lambda: position_units(node)) or 0.0
     return {
         "rated current": rated is not None,
-        "position": bool(_told(lambda: position_units(node))),
+        "position": bool(units),
+        "range": _told(lambda: position_turns(node, units)) is not None,
         "current": _told(lambda: shown_current(node, base)) is not None,
         "torque mode": torque,
         "push": torque or _told(lambda: limited_speed(node)) is not None,
@@ -539,7 +547,7 @@ WAYS: Mapping[str, Mapping[Method, Way]] = {
             from_records=_expected(_INJECT_RUN, 200, ("J_kgm2", 1.5, "%")),
         ),
         Method.RECORDER: Way(
-            (*_RECORD, "position", "encoder"),
+            (*_RECORD, *_SEEN, "encoder"),
             _expected(_RECORDER_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")),
             "J/psi and tau_c/psi",
         ),

@@ -208,6 +208,28 @@ def test_units_of_position_per_turn(held: Held, units: float | str) -> None:
 
 
 @pytest.mark.parametrize(
+    ("ends", "letter", "units", "turns"),
+    [
+        ((0, 0), "i", 4096, None), ((-(2**31), 2**31 - 1), "i", 4096, None), ((0, 16 * 4096 - 1), "i", 4096, None),
+        ((0, 16 * 4096 - 2), "i", 4096, "16 turns"), ((-2048, 2047), "i", 4096, "1 turns"),
+        ((0, 0), "h", 4096, None), ((0, 0), "h", 8192, "8 turns"), ((0, 0), "i", 2**29, "8 turns"),
+    ],
+)  # fmt: skip
+def test_a_position_that_begins_again_shows_no_speed(
+    ends: tuple[int, int], letter: str, units: int, turns: str | None
+) -> None:
+    """A rotary axis kept within a turn, a position of 16 bits, an encoder of 29: the guard could not see a speed."""
+    limits = dict(zip(motion.RANGE_LIMIT, ends, strict=True))
+    with drive({replace(motion.POSITION, letter=letter): 0, **limits}) as node:
+        node.held(motion.POSITION)
+        if turns is None:
+            assert motion.position_turns(node, -units) >= motion.LEAST_TURNS
+        else:
+            with pytest.raises(NotAvailable, match=f"begins again after {turns}"):
+                motion.position_turns(node, -units)
+
+
+@pytest.mark.parametrize(
     ("row", "units"),
     [(MotionObject(number=2000.0), 2000.0), (own("4 1"), 4.0 * 512), (MotionObject(number=20.0), None)],
 )

@@ -132,6 +132,17 @@ def test_a_position_that_cannot_be_read_moves_nothing(tmp_path: Path, tool: Tool
     assert code == 9 and "position in units" in said and "supervision tested" not in said
 
 
+@pytest.mark.parametrize("command", [("check", str(machine_path("interior-2k2"))), ("move", "--by", "5deg")])
+def test_a_rotary_axis_whose_position_begins_again_every_turn_moves_nothing(
+    tmp_path: Path, tool: Tool, command: tuple[str, ...]
+) -> None:
+    """A wrap between two looks would be a speed that is not there, or hide one that is."""
+    ends: tuple[Row, ...] = ((0x607B, 1, "I32", "rw", "0"), (0x607B, 2, "I32", "rw", "4095"))
+    channel = f"interior-2k2?nv=:memory:&eds={write_eds(tmp_path / 'x.eds', unknown('0x2D', *ends))}"
+    code, _, said = tool("--sim", channel, "--yes", *command)
+    assert code == 9 and "0x607B" in said and "begins again" in said and "supervision tested" not in said, said
+
+
 def checked(tool: Tool, rows: tuple[Row, ...]) -> tuple[int, dict[str, str], str]:
     """Return exit code, verdicts and words of `check` on a drive with these objects."""
     channel = f"interior-2k2?nv=:memory:&eds={write_eds(Path('x.eds'), rows)}"
