@@ -23,7 +23,7 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.motion_objects import OVER_SPEED_TRIP, lowered_trip, trips_itself
-from pmsmtool.drive.own_limits import NO_LIMITS, lower_limits, put_limit
+from pmsmtool.drive.own_limits import NO_LIMITS, clear_offsets, lower_limits, put_limit
 from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, ProfileMove, Recording, Shape
 from pmsmtool.errors import (
     BusError,
@@ -144,6 +144,7 @@ class GuardedDrive:
 
     def _limit_in_drive(self) -> None:
         """Make the drive itself keep current and speed where it can."""
+        clear_offsets(self._node)
         self._limits = lower_limits(self._drive, self.envelope)
         self._speed_overshoot = OVERSHOOT if self._limits.speed else 1.0
         if trips_itself(self._node):

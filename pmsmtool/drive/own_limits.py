@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Limits that a drive keeps by itself: lowered to the envelope while it is lent."""
+"""Limits that a drive keeps by itself, lowered while it is lent, and what it adds to commands, cleared meanwhile."""
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.motion_objects import Quantity, allowed, current_limits, rated_apk, speed_limits
+from pmsmtool.drive.objects import DriveObject
 from pmsmtool.errors import NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.units import format_current, rpm_from_rad_s
 
@@ -20,6 +22,8 @@ large as the one that the drive still holds."""
 LEAST_COUNTS = 4
 """Steps of its limit below which a drive is not asked to keep a current or speed: they are too coarse."""
 _ROUNDING = 1e-6
+OFFSETS = (DriveObject(0x60B0, 0, "i"), DriveObject(0x60B1, 0, "i"), DriveObject(0x60B2, 0, "h"))
+"""What a drive adds to commands of position, speed and torque, as another master left it (CiA 402-2)."""
 
 
 class OwnLimits(NamedTuple):
@@ -86,6 +90,29 @@ def lower_limits(drive: CanopenDrive, envelope: Envelope) -> OwnLimits:
         math.inf if speed is None else speed[1],
         tuple(refused),
     )
+
+
+def clear_offsets(node: DriveNode) -> None:
+    """Make the drive add nothing to a command while it is lent.
+
+    Raises
+    ------
+    SafetyRefusal
+        It goes on adding something.
+    """
+    for item in OFFSETS:
+        held = node.held(item)
+        if not held:
+            continue
+        with contextlib.suppress(SdoAbort):
+            node.put(item, 0.0)
+        if node.get(item):
+            raise SafetyRefusal(
+                f"the drive adds {held:g} to every command, and it cannot be cleared",
+                where=f"node {node.node}, 0x{item.index:04X}:00",
+                likely="an offset that another master keeps, or that is set by the maker's software",
+                hint="set it to 0, and run the command again; nothing was energised",
+            )
 
 
 def put_limit(node: DriveNode, limit: Quantity | None, wanted: float, most: float) -> float | None:
