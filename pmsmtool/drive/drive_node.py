@@ -18,6 +18,7 @@ from pmsmtool.cia402 import (
     EXCITATION_ABORTED,
     Command,
     State,
+    Status,
     command_towards_enabled,
     error_text,
     state_of,
@@ -320,6 +321,11 @@ class DriveNode:
 
     def _kept_off_by(self) -> str:
         """Return why the drive may not enable: its DC link (0x6079), where shown, separates supply and inputs."""
+        if not self.whole(objects.STATUSWORD) & Status.REMOTE:
+            return (
+                "it takes no commands from the bus (statusword, bit 9: remote): its maker's software, a panel or "
+                "an input has the control"
+            )
         link_mv = self.held(objects.DC_LINK_MV)
         if link_mv is None:
             return "no DC-link voltage, or a missing hardware enable or safe-torque-off input"

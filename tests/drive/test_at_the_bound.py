@@ -67,6 +67,13 @@ def test_the_link_tells_the_supply_from_the_inputs(link_v: float, said: str) -> 
         assert said in node._kept_off_by()
 
 
+def test_a_drive_that_another_program_has_in_hand_says_so() -> None:
+    with node_of({objects.DC_LINK_MV: 24_000, objects.STATUSWORD: 0x0040}) as (table, node):
+        assert "takes no commands from the bus (statusword, bit 9" in node._kept_off_by()
+        table.objects[0x6041, 0] = (0x0240).to_bytes(2, "little")
+        assert "STO" in node._kept_off_by()
+
+
 def test_a_position_factor_that_says_nothing_new() -> None:
     """4000 increments of the encoder are 2000 units of a factor 2: both say the same of a turn."""
     turn = {motion.POSITION: 0, motion.ENCODER_COUNTS: 4000, motion.FEED: 2000, motion.FACTOR: 2}
