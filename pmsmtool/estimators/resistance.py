@@ -239,13 +239,12 @@ def estimate_resistance(
     warmth = _warmth(levels.t_s, T, fall, i, v, peak, math.hypot(noise_v, MODEL_FLOOR * R_0 * peak))
     sigma_v = _level_sigma(warmth, fall, i, v, peak, R_0, noise_v)
     T_w = float(np.sum(T * i**2) / np.sum(i**2)) if known_T else math.nan
-    share = _copper_share(copper, R_0)
     R_w, v_w = R_0, v
     fits: list[_TailFit] = []
     weights = np.array([])
     for _ in range(TEMPERATURE_PASSES if known_T else 1):
         # R at T_w: what the copper part adds at each level's own temperature moves to the left side
-        slope = _slope_per_k(R_w * share, T_w, copper)
+        slope = _per_k(R_w, copper, T_w)
         v_w = v - slope * (T - T_w) * i if known_T else v
         fits = [_fit_tail(warmth, fall, i, v_w, peak, sigma_v, powers) for powers in tail_models()]
         weights = information_weights([_criterion(fit, len(i)) for fit in fits])
@@ -446,23 +445,13 @@ def settled_levels(levels: Trace, noise: Noise) -> tuple[Trace, int]:
 def resistance_warmed(R: Estimate, T_c: float, copper: Copper) -> float:
     """Return a measured resistance at another temperature of the winding (ohm); as it is where either is unknown."""
     known = math.isfinite(T_c) and math.isfinite(R.T_c)
-    return R.value + (_per_k(R, copper) * (T_c - R.T_c) if known else 0.0)
+    return R.value + (_per_k(R.value, copper, R.T_c) * (T_c - R.T_c) if known else 0.0)
 
 
-def _per_k(R: Estimate, copper: Copper) -> float:
-    """Change per kelvin of a measured resistance (ohm/K): that of its copper part."""
-    return _slope_per_k(R.value * _copper_share(copper, R.value), R.T_c, copper)
-
-
-def _slope_per_k(R_copper: float, T_c: float, copper: Copper) -> float:
-    """Change per kelvin of a copper resistance that was measured at a temperature (ohm/K)."""
-    return R_copper * copper.alpha_per_k / (1.0 + copper.alpha_per_k * (T_c - copper.T_ref_c))
-
-
-def _copper_share(copper: Copper, R_loop: float) -> float:
-    if copper.R_winding_ohm is None:
-        return 1.0
-    return min(1.0, copper.R_winding_ohm / R_loop)
+def _per_k(R_ohm: float, copper: Copper, T_c: float) -> float:
+    """Change per kelvin of a loop resistance whose winding is at ``T_c`` (ohm/K): that of its copper part."""
+    all_copper = R_ohm / (1.0 + copper.alpha_per_k * (T_c - copper.T_ref_c))
+    return copper.alpha_per_k * min(copper.R_winding_ohm or math.inf, all_copper)
 
 
 def _fit_tail(
@@ -537,9 +526,7 @@ def normalised(measured: Estimate, copper: Copper, tolerance: SensorTolerance) -
 
 def _at_reference_ohm(R_ohm: float, copper: Copper, T_c: float) -> float:
     """Return a loop resistance of a winding at ``T_c`` as it is at the reference temperature (ohm)."""
-    rise = copper.alpha_per_k * (T_c - copper.T_ref_c)
-    all_copper = R_ohm / (1.0 + rise)
-    return R_ohm - min(copper.R_winding_ohm or math.inf, all_copper) * rise
+    return R_ohm - _per_k(R_ohm, copper, T_c) * (T_c - copper.T_ref_c)
 
 
 def at_the_test(estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:
