@@ -177,10 +177,10 @@ def test_a_push_that_is_short_or_limited_is_refused() -> None:
 
 
 def test_slopes_within_the_noise_of_the_others_are_none() -> None:
-    part = np.array([0.0, 1.0, -1.0, 0.5, -0.5, 30.0, 5.9, 6.0, -0.2])
-    noise = 1.4826 * np.median(np.abs(part - np.median(part)))
-    expected = np.where(np.abs(part) > 4.0 * noise, part, 0.0)
-    assert np.array_equal(resolved_push._above_noise(part), expected) and np.count_nonzero(expected) == 2
+    """The median is 0.6 and half of all lie within 0.5 of it: 2.965 is the limit."""
+    part = np.array([0.6, 1.1, 0.1, 0.7, 0.5, 2.96, -2.97, 2.97, -0.9])
+    found = resolved_push._above_noise(part)
+    assert np.array_equal(found, np.where(np.abs(part) > 2.965, part, 0.0)) and np.count_nonzero(found) == 2
 
 
 def _rows() -> tuple[Array, Rows, Rows, Rows]:
@@ -278,17 +278,24 @@ def test_the_mean_of_the_shapes_is_told_with_their_spread_and_that_of_the_pushes
     without = np.random.default_rng(16).standard_normal((4, 3, 5))
     given = iter(zip(fits, without, strict=True))
     seen: list[int] = []
+    slopes: list[Rows] = []
 
     def fit(columns: Sequence[Rows], u: Rows, weight: Array, owner: Array, n: int) -> tuple[Array, Array]:
+        slopes.extend(columns[6:8])
         seen.extend((len(u), len(weight), n, *np.bincount(owner)))
         return next(given)
 
     monkeypatch.setattr(resolved_push, "_fit", fit)
     w, i, slope, u = _rows()
+    slope[[10, 20]] = 30.0, 40.0j
     small = np.where(np.arange(40) < 4, 0.17j * 5.0, np.where(np.arange(40) < 8, 0.19j * 5.0, i))
     blocks = Blocks(w, small, slope, u, np.ones(40), 1.0, 0.0, -5.0)
     found = resolved_push.resolve([blocks, replace(blocks, i_q=4.0), replace(blocks, i_q=3.0)])
     assert seen == [108, 108, 3, 36, 36, 36] * 4 and found.rows == 108
+    # of the last shape, whose machine is not linear: slopes above the noise of all, real and imaginary by themselves
+    used = np.tile(slope[4:], 3)
+    assert slopes[6] == pytest.approx(resolved_push._above_noise(used.real))
+    assert slopes[7] == pytest.approx(1j * resolved_push._above_noise(used.imag)) and np.any(slopes[7])
     assert found.value == pytest.approx(np.mean(fits, axis=0), rel=EXACT)
     pushes = np.mean(without, axis=0)
     variance = 2.0 / 3.0 * 3.0 * np.var(pushes, axis=0) + np.var(fits, axis=0, ddof=1)
