@@ -254,8 +254,8 @@ class GovernedTwin(Twin):
             if square(row.voltage(outside)) <= row.V * row.V:
                 return outside
         first, second = (row, circle) if inside else (circle, row)
-        corner = project_pair(first, second, r, outside)
-        return v if corner is None else corner
+        corner, found = project_pair(first, second, r, outside, smallest_voltage(second, first))
+        return corner if corner is not None and found else v
 
     def govern(self, request: Vector) -> Vector:
         options, r, may_start = int(self.values["governor.options"]), request, True
