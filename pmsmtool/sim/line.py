@@ -150,6 +150,8 @@ class Line:
             raise RuntimeError("nothing is on the wire")
         sender, frame = self._on_wire
         self.frames += 1
+        # what waited by now begins when the wire is free; whoever answers this frame has yet to read it
+        waited = heapq.heappop(self._pending)[2:] if self._pending else None
         program = None if isinstance(sender, Node) else sender
         acknowledged = program is None or self.is_acknowledged(program)
         if acknowledged:
@@ -160,7 +162,9 @@ class Line:
         if program is not None:
             program.transmitted(acknowledged)
         self._on_wire = None
-        if self._pending:
+        if waited is not None:
+            self._put_on_wire(*waited)
+        elif self._pending:
             self._put_on_wire(*heapq.heappop(self._pending)[2:])
 
     @property

@@ -87,6 +87,18 @@ def test_the_lowest_identifier_wins_when_the_wire_becomes_free(bench: Bench) -> 
     assert [m.arbitration_id for m in order if m is not None] == [0x300, 0x080, 0x123, 0x123 << 18 | 5, 0x7FF]
 
 
+def test_what_waited_goes_before_the_answer_to_a_frame_that_has_just_come(bench: Bench) -> None:
+    """A node reads a frame before it answers; meanwhile the wire is free for what waited."""
+    second = PmsmSimBus("bench", line=bench.line)
+    with bench.bus.clock.held:
+        for frame in (Frame(0x601, READ_SERIAL), Frame(0x7FF, b"a")):
+            bench.bus._in_flight += 1
+            bench.line.queue(bench.bus, frame)
+    order = [second.recv(0.01) for _ in range(3)]
+    second.shutdown()
+    assert [m.arbitration_id for m in order if m is not None] == [0x601, 0x7FF, 0x581]
+
+
 def test_programs_on_one_line_hear_each_other_and_themselves_on_request(bench: Bench) -> None:
     second = PmsmSimBus("bench", line=bench.line, receive_own_messages=True)
     second.send(message(0x123, b"hello"))
