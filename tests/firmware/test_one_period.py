@@ -72,10 +72,20 @@ def saturated(**changes: float) -> tuple[Loop, Any]:
     return loop_of(lut=nodes().tobytes(), **{f"saturation__{key}": value for key, value in table.items()} | changes)
 
 
-def test_between_and_beyond_the_nodes_of_the_saturation_table() -> None:
-    """Bilinear between them; beyond them the flux goes on with the inductances of the edge."""
+def at_nodes(i: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The table's nearest point to a current (A, i_q without its sign), and what it has there."""
     axes = np.linspace(*I_D, N_D), np.linspace(0.0, I_Q_MAX, N_Q)
-    tables = RegularGridInterpolator(axes, nodes().astype(float))
+    edge = np.array([np.clip(i[0], *I_D), min(abs(i[1]), I_Q_MAX)])
+    return edge, RegularGridInterpolator(axes, nodes().astype(float))(edge)[0]
+
+
+def flux(i: np.ndarray) -> tuple[float, float]:
+    """psi_d, psi_q (Wb): bilinear between the nodes; beyond them it goes on with the inductances of the edge."""
+    edge, (psi_d, apparent, L_d, L_q) = at_nodes(i)
+    return psi_d + L_d * (i[0] - edge[0]), math.copysign(apparent * edge[1] + L_q * (abs(i[1]) - edge[1]), i[1])
+
+
+def test_between_and_beyond_the_nodes_of_the_saturation_table() -> None:
     loop, v = saturated()
     rng = np.random.default_rng(3)
     points = [*rng.uniform((-40, -30), (20, 30), (40, 2)), (I_D[0], 0.0), (I_D[1], -I_Q_MAX), (0.0, 2 * I_Q_MAX)]
@@ -83,13 +93,10 @@ def test_between_and_beyond_the_nodes_of_the_saturation_table() -> None:
         loop.plant.i = np.array(point, dtype=float)
         live = loop.step(mode=MODE_CURRENT)
         i = np.array([live.i_d, live.i_q])
-        edge = np.array([np.clip(i[0], *I_D), min(abs(i[1]), I_Q_MAX)])
-        psi_d, apparent, L_d, L_q = tables(edge)[0]
-        psi = psi_d + L_d * (i[0] - edge[0]), math.copysign(apparent * edge[1] + L_q * (abs(i[1]) - edge[1]), i[1])
+        (_, _, L_d, L_q), psi = at_nodes(i)[1], flux(i)
         m = loop.state.local
         close([m.L_d, m.L_q, m.L_d_app], [L_d, L_q, L_d])
         close([m.psi_f + m.L_d_app * i[0], m.L_q_app * i[1]], psi)
-        close(m.L_q_app if i[1] == 0 else apparent, apparent)
         gains = [v[f"current.K_p_{axis}_v_per_a"] / v[f"motor.L_{axis}_h"] for axis in "dq"]
         close(dq(m.K_p), [L_d * gains[0], L_q * gains[1]])
         close(live.tau, 1.5 * v["motor.pole_pairs"] * (psi[0] * i[1] - psi[1] * i[0]))

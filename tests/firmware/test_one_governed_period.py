@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: MIT
+"""One governed period of the core in double from a random memory, against solvers that are written out here."""
+
+from __future__ import annotations
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from pmsmtool.firmware.core_binding import core
+from tests.firmware.closed_loop import (
+    BEST,
+    CURRENT_ROW,
+    FLAG_ACTIVE,
+    FLAG_FALLBACK,
+    HEXAGON,
+    LINEARISED,
+    MINIMUM_TIME,
+    MODE_CURRENT,
+    OBSERVE,
+    PREDICTOR,
+    RPM,
+    Loop,
+    reference_case,
+)
+from tests.firmware.governor_rows import Table1, paper_rows
+from tests.firmware.test_one_period import close, dq, flux, put, saturated, turned
+
+V_DC, STEERED, EMPTY, NONE = 210.0, 250, 254, 255
+NEAREST_A = 3e-5
+"""Of the exchange from the enumeration; measured 9e-6, by binary32 parameters."""
+BINDING_STEADY = 253
+TIME, DIRECTION = 2e-3, 1e-3
+"""Of T and V: the search ends where the gap is below 1 % of V T, with a last Newton step; measured 8e-4, 3e-4."""
+
+
+def governed(mode: int, **changes: float) -> Loop:
+    loop = Loop(core(double=True), reference_case(4000.0, governor__mode=mode, **changes), omega=1.0, U_dc=V_DC)
+    loop.step(mode=MODE_CURRENT)
+    return loop
+
+
+def nearest_under_planes(a: np.ndarray, b: np.ndarray, r: np.ndarray) -> tuple[np.ndarray | None, set[int]]:
+    """Of r itself, its foot on each line and each corner, the nearest that all planes allow; and the planes there."""
+    size = np.linalg.norm(a, axis=1)
+    a, b = a / size[:, None], b / size
+    j, k = np.triu_indices(len(b), 1)
+    det = a[j, 0] * a[k, 1] - a[j, 1] * a[k, 0]
+    j, k, det = j[abs(det) > 1e-9], k[abs(det) > 1e-9], det[abs(det) > 1e-9]
+    corners = [(b[j] * a[k, 1] - b[k] * a[j, 1]) / det, (b[k] * a[j, 0] - b[j] * a[k, 0]) / det]
+    points = np.concatenate([[r], r - (a @ r - b)[:, None] * a, np.stack(corners, axis=1)])
+    allowed = points[(points @ a.T - b).max(axis=1) < 1e-9]
+    if not len(allowed):
+        return None, set()
+    x = allowed[np.linalg.norm(allowed - r, axis=1).argmin()]
+    return x, set(np.flatnonzero(np.abs(a @ x - b) < 1e-6).tolist())
+
+
+@pytest.mark.parametrize("k_max", [0, 3, 200])
+def test_linearised_rows_are_the_papers_with_octagons(k_max: int) -> None:
+    """The nearest point under all faces of all rows, by enumeration; the binding row is one of its faces'."""
+    eps = 0.02
+    loop, rng = governed(LINEARISED, governor__eps=eps, governor__k_max=k_max), np.random.default_rng(1)
+    machine, seen = Table1(T_s=loop.plant.T_s), set()
+    rows_most = min(k_max, 15)
+    normals = np.array([[math.cos(k * math.pi / 4), math.sin(k * math.pi / 4)] for k in range(8)])
+    for _ in range(25 if k_max < 100 else 8):
+        omega = loop.plant.omega = float(rng.uniform(-900, 900)) * RPM
+        i = loop.plant.i = rng.uniform(-25, 25, 2)
+        x = put(loop.state.integrator, rng.uniform(-15, 15, 2))
+        target = rng.uniform(-45, 45, 2)
+        live = loop.step(mode=MODE_CURRENT, i_d_ref=target[0], i_q_ref=target[1])
+        v = np.array([live.i_d_ref, live.i_q_ref])
+        rows = paper_rows(machine, omega, i, x / machine.gains[2], rows_most, eps)
+        a = np.concatenate([normals @ M for M, _, _ in rows])
+        b = np.concatenate([math.cos(math.pi / 8) * V - normals @ c for _, c, V in rows])
+        expected, faces = nearest_under_planes(a, b, target)
+        assert bool(live.flags & FLAG_FALLBACK) == (expected is None)
+        if expected is not None:
+            assert np.abs(v - expected).max() < NEAREST_A
+            bound = {BINDING_STEADY if face // 8 == len(rows) - 1 else face // 8 for face in faces} or {NONE}
+            assert live.binding in bound
+            assert bool(live.flags & FLAG_ACTIVE) == (live.binding != NONE)
+            seen |= bound
+    assert len(seen) > 1
+
+
+def test_observe_says_what_the_rows_would_and_lets_the_reference_pass() -> None:
+    """As the law of the same rows, which does not let it pass."""
+    settings = {
+        "governor__eps": 0.01,
+        "governor__observer_gain": 0.0,
+        "governor__options": CURRENT_ROW,
+        "governor__I_transient_apk": 30.0,
+    }
+    watching, acting = governed(OBSERVE, **settings), governed(BEST, **settings)
+    rng, bindings = np.random.default_rng(2), set()
+    for _ in range(60):
+        omega, i, x, held = rng.choice([60.0, 600.0, 1200.0]) * rng.uniform(-1, 1) * RPM, *rng.uniform(-20, 20, (3, 2))
+        target, live = rng.uniform(-90, 90, 2) * rng.choice([0.2, 1.0]), []
+        for loop in (watching, acting):
+            loop.plant.omega, loop.plant.theta, loop.plant.i = omega, 0.3, i.copy()
+            put(loop.state.integrator, x)
+            put(loop.state.reference_held, held)
+            live.append(loop.step(mode=MODE_CURRENT, i_d_ref=target[0], i_q_ref=target[1]))
+        request = np.array([live[0].i_d_req, live[0].i_q_req])
+        close([live[0].i_d_ref, live[0].i_q_ref], request)
+        if live[1].flags & FLAG_FALLBACK:
+            assert live[0].binding == EMPTY
+        else:
+            assert live[0].binding == live[1].binding
+            v, way = np.array([live[1].i_d_ref, live[1].i_q_ref]), request - held
+            share = 1.0 if (v == request).all() else float(np.clip((v - held) @ way / (way @ way), 0.0, 1.0))
+            assert live[1].kappa == pytest.approx(share, abs=1e-12)
+            assert live[0].kappa == pytest.approx(share, abs=2e-6)  # row 0 is met to rounding afterwards
+        bindings.add(live[0].binding)
+    assert bindings == {0, 252, BINDING_STEADY, EMPTY, NONE}
+
+
+def hexagon(angle: float, U_dc: float) -> float:
+    """Radius (V) of the inverter's hexagon in a direction of the stator."""
+    return U_dc / math.sqrt(3) / math.cos(angle % (math.pi / 3) - math.pi / 6)
+
+
+def test_row_zero_reaches_to_the_hexagon() -> None:
+    """Equal gains of both axes: the nearest reference keeps the direction of the demand, in which it is as long."""
+    L = {f"motor__L_{axis}{kind}_h": 0.002 for axis in "dq" for kind in ("", "_app")}
+    K = {f"current__K_p_{axis}_v_per_a": 8.0 for axis in "dq"}
+    loop = governed(BEST, governor__options=HEXAGON, governor__observer_gain=0.0, **L, **K)
+    rng = np.random.default_rng(3)
+    for _ in range(30):
+        omega = loop.plant.omega = rng.uniform(-200, 200) * RPM
+        loop.plant.i, theta = rng.uniform(-10, 10, 2), loop.plant.theta
+        x = put(loop.state.integrator, rng.uniform(-5, 5, 2))
+        target = 38.0 * np.array([math.cos(k := rng.uniform(0, 2 * math.pi)), math.sin(k)])
+        live = loop.step(mode=MODE_CURRENT, i_d_ref=target[0], i_q_ref=target[1])
+        i, psi = np.array([live.i_d, live.i_q]), loop.params.motor_psi_f_wb
+        asked = 8.0 * (target - i) + x + omega * np.array([-0.002 * i[1], 0.002 * i[0] + psi])
+        angle = cmath.phase(complex(*asked)) + theta + 0.5 * loop.plant.T_s * omega
+        size = math.hypot(*asked)
+        radius = hexagon(angle, V_DC)
+        assert size > radius
+        assert [live.u_d, live.u_q] == pytest.approx(asked * radius / size, abs=1e-4)  # measured 6e-5: INSIDE
+        assert live.binding == 0
+
+
+@pytest.mark.parametrize("law", ["now", "predicted", "late", "saturated"])
+def test_the_minimum_time_direction(law: str) -> None:
+    """|m(T)| = V T by a bracketing search for the smallest T, the voltage of the period along m(T)."""
+    changes: dict[str, float] = {
+        "governor__options": MINIMUM_TIME | (PREDICTOR if law == "predicted" else 0),
+        "governor__I_transient_apk": 300.0,
+        "inverter__delay_periods": 1.5 if law in ("predicted", "late") else 0.5,
+    }
+    if law == "saturated":
+        loop, _ = saturated(governor__mode=BEST, inverter__voltage_utilisation=1 / math.sqrt(3), **changes)
+        loop.U_dc = loop.measurement.U_dc = V_DC
+    else:
+        loop = governed(BEST, **changes)
+    p, state, plant, rng = loop.params, loop.state, loop.plant, np.random.default_rng(4)
+    V, T_s, R, found = p.inverter_voltage_utilisation * V_DC, plant.T_s, p.motor_R_s_ohm, 0
+    rpm, size = (150.0, 9.0) if law == "saturated" else (600.0, 45.0)
+    for _ in range(120):
+        omega = plant.omega = float(rng.choice([-1, 1]) * rng.uniform(0.3, 1.0) * rpm) * RPM
+        plant.i, theta = rng.uniform(-size, size, 2), plant.theta
+        target, acting = rng.uniform(-size, size, 2), rng.uniform(-60, 60, 2)
+        put(state.integrator, rng.uniform(-2, 2, 2))
+        put(state.disturbance, rng.uniform(-2, 2, 2))
+        state.voltage_committed.d, state.voltage_committed.q = acting
+        state.time_to_go, state.landing = 0.0, 0
+        live = loop.step(mode=MODE_CURRENT, i_d_ref=target[0], i_q_ref=target[1])
+        if live.binding != STEERED:
+            continue
+        d, i = dq(state.disturbance), np.array([live.i_d, live.i_q])  # as the observer has left it
+        m = state.local if law == "saturated" else state.derived.nominal
+        psi, drop = np.array([m.psi_f + m.L_d_app * i[0], m.L_q_app * i[1]]), 0.5 * T_s * R
+        if law in ("predicted", "late"):
+            L, fixed = np.array([m.L_d, m.L_q]), psi + T_s * (turned(acting, theta) - d) - drop * i
+            ahead = (L * i + turned(fixed, omega * T_s) - psi) / (L + drop)
+            psi, i = turned(fixed, omega * T_s) - drop * ahead, ahead
+        b = flux(target) if law == "saturated" else (m.psi_f + m.L_d_app * target[0], m.L_q_app * target[1])
+        halves = 0.5 * complex(*(R * i + d)), 0.5 * complex(*(R * target + d))
+
+        def way(T: float, start: complex, end: complex, halves: tuple[complex, complex], omega: float) -> complex:
+            turn = cmath.exp(1j * omega * T)
+            return turn * end - start + (halves[0] + turn * halves[1]) * T
+
+        case = complex(*psi), complex(*b), halves, omega
+        grid = np.linspace(T_s, 120 * T_s, 1500)
+        first = next(k for k, T in enumerate(grid) if abs(way(T, *case)) < V * T)
+        T = brentq(lambda T, *case: abs(way(T, *case)) - V * T, grid[first - 1], grid[first], args=case)
+        w = way(T, *case) * cmath.exp(-0.5j * omega * T_s)
+        assert state.time_to_go == pytest.approx(T, rel=TIME)
+        assert abs(complex(live.u_d, live.u_q) - w * V / abs(w)) < DIRECTION * V
+        assert state.landing == (law != "late")
+        found += 1
+    assert found > 20
