@@ -20,6 +20,7 @@ from tests.firmware.closed_loop import (
     LINEARISED,
     MINIMUM_TIME,
     MODE_CURRENT,
+    MODE_TORQUE,
     OBSERVE,
     PREDICTOR,
     RPM,
@@ -198,3 +199,69 @@ def test_the_minimum_time_direction(law: str) -> None:
         assert state.landing == (law != "late")
         found += 1
     assert found > 20
+
+
+@pytest.mark.parametrize("axis", ["d", "q"])
+def test_a_controller_without_a_proportional_part_is_not_governed(axis: str) -> None:
+    loop = governed(BEST, **{f"current__K_p_{axis}_v_per_a": 0.0})
+    live = loop.step(mode=MODE_CURRENT, i_d_ref=-50.0, i_q_ref=10.0)
+    close([live.i_d_ref, live.i_q_ref, live.binding, live.kappa], [-50.0, 10.0, NONE, 1.0])
+
+
+@pytest.mark.parametrize("alpha", [4000.0, 9000.0])
+def test_a_transfer_lands_with_a_quarter_of_its_error(alpha: float) -> None:
+    """On the machine's model, as far as the request is admissible; far from the end not beyond the voltage."""
+    loop = Loop(core(double=True), reference_case(alpha, governor__mode=BEST, governor__options=MINIMUM_TIME,
+                                                  governor__observer_gain=0.0), omega=50.0, U_dc=V_DC)  # fmt: skip
+    loop.step(mode=MODE_CURRENT)
+    p, state, T_s = loop.params, loop.state, loop.plant.T_s
+    L, K = (np.array([getattr(p, name.format(axis)) for axis in "dq"])
+            for name in ("motor_L_{}_h", "current_K_p_{}_v_per_a"))  # fmt: skip
+    gain = 0.74 * L / (K * T_s)
+    assert (gain > 1.0).all() == (alpha < 5000)
+    for step, left, landing in ((1.0, 2.0, 1), (1.0, 20.0, 1), (6.0 if alpha < 5000 else 2.0, 20.0, 1), (1.0, 2.0, 0)):
+        i, r = np.array([2.0, 3.0]), np.array([2.0, 3.0]) + step
+        loop.plant.i = i.copy()
+        put(state.integrator, np.array([0.0, 0.0]))
+        state.landing, state.time_to_go = landing, left * T_s
+        live = loop.step(mode=MODE_CURRENT, i_d_ref=r[0], i_q_ref=r[1])
+        i = np.array([live.i_d, live.i_q])
+        lands = landing and gain[0] > 1.0
+        expected = i + gain * (r - i) if lands else r
+        u = K * (expected - i) + loop.plant.omega * np.array([-p.motor_L_q_app_h * i[1],
+                                                             p.motor_L_d_app_h * i[0] + p.motor_psi_f_wb])  # fmt: skip
+        beyond = math.hypot(*u) > p.inverter_voltage_utilisation * V_DC
+        assert beyond == (step == 6.0 and bool(lands))
+        close([live.i_d_ref, live.i_q_ref], r if beyond else expected, 10.0)
+        assert (live.binding == STEERED) == (landing and not beyond)
+        assert (state.landing, state.time_to_go) == (0, 0.0)
+
+
+def test_a_transfer_waits_while_the_look_up_searches() -> None:
+    """A torque far beyond the current limit: the period has time for row 0 alone, the transfer stays as it is."""
+    torque = np.linspace(-80.0, 80.0, 17)
+    i_q = np.repeat(torque[:, None] / 2.0, 2, axis=1)
+    parts = (torque, [0.0, 1000.0], [V_DC], np.zeros((17, 2)), i_q)
+    lut = b"".join(np.asarray(part, dtype=np.float32).tobytes() for part in parts)
+    descriptor = {"format": 1, "n_x": 17, "n_y": 2, "n_z": 1, "axis_kind": 0}
+    equal = {f"motor__L_{axis}{kind}_h": 0.002 for axis in "dq" for kind in ("", "_app")}
+    equal |= {f"current__K_p_{axis}_v_per_a": 8.0 for axis in "dq"}
+    values = reference_case(
+        4000.0, governor__mode=BEST, governor__options=MINIMUM_TIME, governor__observer_gain=0.0, motor__I_max_apk=18.0,
+        protection__I_cont_apk=18.0, field_weakening__mode=1, **equal,
+        **{f"lut__{key}": value for key, value in descriptor.items()},
+    )  # fmt: skip
+    loop = Loop(core(double=True), values, omega=100.0, U_dc=V_DC, lut=lut)
+    loop.step(mode=MODE_TORQUE)
+    for tau, searching in ((75.0, True), (-75.0, True), (30.0, False)):
+        loop.plant.i = np.array([0.0, 0.0])
+        loop.state.lut_cut, loop.state.time_to_go = 0, 5 * loop.plant.T_s
+        x = put(loop.state.integrator, np.array([-90.0, 10.0]))
+        live = loop.step(mode=MODE_TORQUE, tau_ref=tau)
+        request = np.array([live.i_d_req, live.i_q_req])
+        close(request, [0.0, math.copysign(min(abs(tau) / 2.0, 18.0), tau)])
+        assert (live.binding == 0 and loop.state.time_to_go == 5 * loop.plant.T_s) == searching
+        if searching:
+            u = 8.0 * request + x + [0.0, loop.plant.omega * loop.params.motor_psi_f_wb]
+            V = loop.params.inverter_voltage_utilisation * V_DC
+            assert [live.u_d, live.u_q] == pytest.approx(u * V / math.hypot(*u), abs=1e-4)
