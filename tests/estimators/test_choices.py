@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: MIT
+"""Where an estimator chooses: which fit explains, which swing is one, which knee, which ripple; both sides."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from pmsmtool.arrays import Array
+from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.encoder import PER_TURN_LEAST_RAD, PER_TURN_SURE, _per_turn
+from pmsmtool.estimators.flux import map_fit
+from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.refusals import refuse
+from pmsmtool.estimators.shaft import frequency_response as fr
+from pmsmtool.estimators.shaft import mechanics, response_lines, swing
+from pmsmtool.estimators.shaft.model import Run
+from pmsmtool.trace import Trace
+
+
+def _trace(t: Array, meta: dict[str, Any] | None = None, **signals: Array) -> Trace:
+    return Trace(t, signals, dict.fromkeys(signals, "1"), meta or {})
+
+
+# ---- which swing is one -----------------------------------------------------------------------------------------
+
+
+def _swing_of(
+    monkeypatch: pytest.MonkeyPatch, peaks: dict[float, float], resonance: float = 0.0, doubt: float = 0.0
+) -> float:
+    """What is told of pushes of 0.2 s at 1 kHz that swing explains so: at a frequency and a percent around it."""
+
+    def explained(hz: float) -> float:
+        return max((share for at, share in peaks.items() if abs(hz / at - 1.0) < 0.04), default=0.0)
+
+    monkeypatch.setattr(swing, "_explained", lambda *_: explained)
+    t = 3.0 + 1e-3 * np.arange(201)
+    return swing.swing_of([_trace(t, x=t), _trace(t[:101], x=t[:101])], lambda d, q: q, resonance, doubt)
+
+
+def test_a_swing_must_explain_half_of_what_a_rigid_shaft_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
+    for share, found in ((0.501, True), (0.499, False)):
+        assert (_swing_of(monkeypatch, {80.0: share}) > 0.0) is found
+    assert _swing_of(monkeypatch, {80.0: 0.9}) == pytest.approx(80.0, rel=0.05)
+    assert _swing_of(monkeypatch, {10.0: 0.9}) == 0.0  # two swings of the longest: the slowest is friction
+    assert _swing_of(monkeypatch, {11.0: 0.9}) > 10.3
+    assert _swing_of(monkeypatch, {210.0: 0.9}) == 0.0  # a fifth of the rows' rate is 200
+
+
+def test_another_resonance_is_twice_the_claimed_one_and_that_explains_less_than_half_as_much(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert _swing_of(monkeypatch, {70.0: 0.8}, 30.0) == pytest.approx(70.0, rel=0.05)
+    assert _swing_of(monkeypatch, {50.0: 0.8, 30.0: 0.3}, 30.0) == 0.0
+    for claimed, found in ((0.39, True), (0.41, False)):
+        assert (_swing_of(monkeypatch, {70.0: 0.8, 30.0: claimed}, 30.0) > 0.0) is found
+    for claimed in (27.0, 33.0):  # within its doubt it is looked for, too
+        assert _swing_of(monkeypatch, {70.0: 0.8, claimed: 0.7}, 30.0, 3.0) == 0.0
+    for most, claimed, found in ((0.201, 0.019, True), (0.199, 0.0, False), (0.3, 0.031, False), (0.3, 0.029, True)):
+        assert (_swing_of(monkeypatch, {50.0: most, 30.0: claimed}, 30.0) > 0.0) is found  # a bounce: at any distance
+    assert _swing_of(monkeypatch, {80.0: 0.9}, 170.0) == 0.0  # nothing is left between 1.2 of it and 200 Hz
+
+
+# ---- which fit explains -----------------------------------------------------------------------------------------
+
+
+def _fitted(noises: Sequence[float | None]) -> Any:
+    """A fit of the whole traces and of their fast part, with so much noise of the torque each; None: refused."""
+    theta, torque = np.linspace(0.0, 1.0, 11), np.ones(10)
+    answers = iter(noises)
+
+    def fitted(runs: Sequence[Trace]) -> Any:
+        noise = next(answers)
+        if noise is None:
+            raise refuse("E_NOT_CONVERGED", "none", stage="s")
+        blocks = [Run(theta, torque, 0.1, np.ones(11), 1e-3, False)]
+        return blocks, len(runs[0]), 1.0, [Run(theta, torque, 0.1, np.ones(11), noise, False)]
+
+    return fitted
+
+
+@pytest.mark.parametrize(
+    ("noises", "whole"),
+    [
+        ([1.9e-3], True),
+        ([2.1e-3, 2.0e-3], False),
+        ([2.1e-3, 2.2e-3], True),
+        ([2.1e-3, None], True),
+        ([None, 9.0], False),
+    ],
+)
+def test_the_fast_part_of_the_traces_is_taken_where_it_needs_less_noise(
+    noises: Sequence[float | None], whole: bool
+) -> None:
+    t = 0.01 * np.arange(400)
+    run = _trace(t, theta_M_rad=np.where(t < 2.0, 3.0 * t, 6.0 + 0.1 * (t - 2.0)))
+    found = mechanics._explained(_fitted(noises), [run])
+    assert (found[1] == 400) is whole
+    with pytest.raises(IdentificationError, match="E_NOT_CONVERGED"):
+        mechanics._explained(_fitted([None, None]), [run])
+
+
+# ---- which knee, which slope ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_knee_is_the_ramp_that_fits_best(seed: int) -> None:
+    """Against another optimiser from every point; measured: 2e-8."""
+    rng = np.random.default_rng(seed)
+    i = np.geomspace(0.1, 10.0, 14)
+    u = -2.0 * np.tanh(i / rng.uniform(0.3, 3.0)) * rng.uniform(0.95, 1.05, 14)
+    found = InverterCurve(i, u, 0.0).knee_a(-2.0)
+
+    def cost(log_knee: float) -> float:
+        return float(np.sum((u / -2.0 - np.minimum(1.0, i / math.exp(log_knee))) ** 2))
+
+    tried = [minimize_scalar(cost, bracket=(math.log(x), math.log(x) + 0.05)) for x in np.geomspace(0.1, 10.0, 25)]
+    assert cost(math.log(found)) <= min(one.fun for one in tried) * (1.0 + 1e-6)
+    assert InverterCurve(i, u, 0.0).knee_a(0.0) == 0.1
+
+
+def test_inductances_below_a_tenth_of_their_median_are_told_with_it() -> None:
+    """psi_d = L (i - i^3/300): its slope falls from L to nothing at 10 A, within the circle of the data."""
+    spline = CoenergySpline.over(np.array([-12.0, 12.0]), np.array([-12.0, 12.0]), (5, 5))
+    d, q = (grid.ravel() for grid in np.meshgrid(*2 * [np.linspace(-12.0, 12.0, 40)], indexing="ij"))
+    rows = np.concatenate([spline.derivative(d, q, 1, 0), spline.derivative(d, q, 0, 1)])
+    x = np.linalg.lstsq(rows, np.concatenate([1e-3 * (d - d**3 / 300.0), 2e-3 * q]), rcond=None)[0]
+    i = np.array([[-10.5, 10.5, 0.0], [0.0, 0.0, 10.5]])
+    found, least = map_fit._falling(spline, x, i)
+    axis_d, axis_q = np.linspace(-10.5, 10.5, 50), np.linspace(0.0, 10.5, 50)
+    i_d, i_q = (grid.ravel() for grid in np.meshgrid(axis_d, axis_q, indexing="ij"))
+    inside = np.hypot(i_d, i_q) <= 10.5
+    L = 1e-3 * (1.0 - i_d[inside] ** 2 / 100.0)
+    bound = 0.1 * np.median(L)
+    assert (
+        least == pytest.approx(np.full(np.count_nonzero(bound > L), bound), rel=1e-3) and len(found) == len(least) > 3
+    )
+    assert found @ x == pytest.approx(L[bound > L], abs=1e-6)
+
+
+# ---- which order ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("once", "differs", "clear"),
+    [(1.01, 0.0, True), (0.99, 0.0, False), (4.0, 0.99, True), (4.0, 1.01, False)],
+)
+def test_an_error_of_the_encoder_is_large_and_alike_in_both_directions(
+    once: float, differs: float, clear: bool
+) -> None:
+    """In units of 2 mrad; what the directions do not share counts four times."""
+    size = once * PER_TURN_LEAST_RAD
+    apart = differs * size / PER_TURN_SURE
+    runs = []
+    for sign in (1.0, -1.0):
+        theta = np.arange(0.0, 2.0 * math.pi, 2.0 * math.pi / 720.0)
+        off = size * np.cos(theta - 0.4) + sign * apart * np.cos(theta - 2.0) + 0.3 * size * np.sin(2.0 * theta)
+        runs.append(_trace(theta, theta_M_rad=theta, theta_imposed_rad=-5.0 * (theta - off)))
+    found = _per_turn(runs[0], runs[1], -5)
+    assert found[0] == pytest.approx(size if clear else 0.0, rel=1e-6, abs=1e-12)
+    assert found[1] == pytest.approx(0.3 * size if 0.3 * size > PER_TURN_LEAST_RAD else 0.0, rel=1e-6, abs=1e-12)
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("amplitude", [0.3, 0.005, 0.001])
+def test_a_torque_over_the_angle_that_one_mass_leaves_is_taken_along(amplitude: float) -> None:
+    """Its transforms come back with size and phase, where it stands out of the noise: off by 2.2 and 0.7 deviations."""
+    rng = np.random.default_rng(101)
+    n, T, J, order = 2502, 4e-4, 2e-3, 7
+    t = T * np.arange(n)
+    runs, torques, ripples = [], [], []
+    for _ in range(3):
+        theta = 25.0 * t + 0.5 * np.cumsum(rng.standard_normal(n)) * T
+        torques.append(rng.standard_normal(n))
+        ripples.append(amplitude * np.cos(order * theta - 0.6))
+        runs.append(_trace(t, theta_M_rad=-theta))
+    omega, U, _, _ = response_lines.transforms(runs, torques, -1)
+    ripple = response_lines.transforms(runs, ripples, -1)[1]
+    noise = rng.standard_normal(U.shape) + 1j * rng.standard_normal(U.shape)
+    Y = (U + ripple) / J + 300.0 * noise
+    inner = slice(fr.HALF_WIDTH, U.shape[1] - fr.HALF_WIDTH)
+    sigma = np.full(U.shape[1], 300.0 * math.sqrt(2.0))[inner]
+    lines = fr._Lines(omega[inner], np.exp(-1j * omega[inner] * T), T, U[:, inner], Y[:, inner], sigma)
+    rigid = fr._fit(lines, fr._rigid, np.array([math.log(1.0 / J), 0.0]))
+    found = fr._ripple(lines, rigid, runs, -1, U.shape[1])
+    # what it explains of white noise, against what the information criterion asks of two more numbers
+    gain = 2.0 * float(np.sum(np.abs(ripple[:, inner] / J) ** 2 / sigma**2))
+    asked = 2.0 * math.log(len(rigid.residual)) + 10.0
+    assert (found is None) is (gain < asked)
+    if found is not None:
+        assert float(np.linalg.norm(found - ripple)) < 3.0 * math.sqrt(2.0 / gain) * float(np.linalg.norm(ripple))
