@@ -152,8 +152,9 @@ def test_what_drives_itself_or_stands_for_something_else_is_no_model() -> None:
     plain = axis_fit._average(shots, slow, 0.05, good, None).L_h
     for layout, part, R, counts in (
         (_layout(eddy=True), [0.1, -1.0], 1.0, True), (_layout(eddy=True), [-0.1, -1.0], 1.0, False),
-        (_layout(eddy=True), [0.1, -1.0], 0.99 * LEAST_R, False), (_layout(motion=True), [-0.1], 1.0, False),
-        (_layout(motion=True), [0.1], 1.0, True),
+        (_layout(eddy=True), [0.1, -1.0], LEAST_R, False), (_layout(eddy=True), [0.0, -1.0], 1.0, True),
+        (_layout(motion=True), [-0.1], 1.0, False),
+        (_layout(motion=True), [0.1], 1.0, True), (_layout(motion=True), [0.0], 1.0, True),
         (replace(_layout(motion=True), motion=Motion(0.0, 1.0)), [-0.1], 1.0, True),
     ):  # fmt: skip
         more = (_fit([0.5, R, 1.0, -2.0, *part, 0.3, -0.2], 15.0, seed=9), layout)

@@ -144,6 +144,7 @@ def test_the_part_of_a_residual_in_step_with_the_square_wave() -> None:
     [
         (1.1, True, 1.0, (Verdict.PASS, math.sqrt(1.1), 0.0)), (2.9, True, 1.0, (Verdict.WARN, math.sqrt(2.9), 0.0)),
         (3.1, False, 1.0, (Verdict.WARN, math.sqrt(3.1), 0.0)),
+        (3.0, True, 1.0, (Verdict.WARN, math.sqrt(3.0), 0.0)), (300.0, False, 1.0, None),
         (299.0, False, 1.0, (Verdict.WARN, math.sqrt(299.0), 0.0)),
         (301.0, False, 1.0, None), (3.1, True, 0.049, (Verdict.WARN, math.sqrt(3.1), 0.049)), (3.1, True, 0.051, None),
         (1e4, True, 0.049, (Verdict.WARN, 100.0, 0.049)),

@@ -212,7 +212,7 @@ def test_what_a_reader_is_told_of_a_map() -> None:
     told = map_result._notes(_fit(symmetric=False, axis_rad=math.radians(-1.25)), 0.0123, 0.0034, 9.1, 10.0)
     assert told[0].startswith("flux map: not symmetric in i_q, 1.2 % of the flux range rms") and "-1.25 deg" in told[0]
     assert "a freer model is 0.34 % of the flux range rms" in told[1] and "known up to 9.1 A of 10 A" in told[2]
-    assert map_result._notes(_fit(), 0.0123, 0.0019, 10.0, 10.0) == ()
+    assert map_result._notes(_fit(), 0.0123, 0.002, 10.0, 10.0) == ()
 
 
 def test_pulses_must_turn_their_voltage() -> None:

@@ -181,9 +181,10 @@ def test_more_noise_is_what_the_residual_of_each_push_and_of_all_coasting_asks_f
     assert [run.torque_std for run in found] == pytest.approx(expected, rel=EXACT)
     quiet = np.concatenate([np.full(10, 1.1), np.full(20, 1.1), np.full(10, 1.1), np.full(30, 1.1)])
     assert mechanics._noisier(runs, quiet, 0.5) is runs
+    assert mechanics._noisier(runs, np.tile([0.5, 1.5], 35), 0.5) is runs  # 1.25 each
     assert mechanics._noise(runs) == pytest.approx({False: 0.04, True: 4e-4})
     assert mechanics._unexplained(runs, [replace(runs[0], torque_std=0.081)])
-    assert not mechanics._unexplained(runs, [replace(runs[0], torque_std=0.039), replace(runs[1], torque_std=3.9e-4)])
+    assert not mechanics._unexplained(runs, [replace(runs[0], torque_std=0.04), replace(runs[1], torque_std=3.9e-4)])
 
 
 def test_friction_that_may_be_all_of_the_torque_is_useless() -> None:
@@ -392,6 +393,7 @@ def test_the_inertia_is_that_of_all_that_turns() -> None:
             0.05 * value, rel=EXACT
         )
         assert found.std == pytest.approx(value * math.sqrt(own + 0.02**2 + 1e-6), rel=1e-6)
+    assert fr._inertia(fit, 3.0, tuple(weights.tolist()), 0.02, tolerance) is not None
     assert fr._inertia(fit, 3.01, tuple(weights.tolist()), 0.02, tolerance) is None
     assert fr._inertia(replace(fit, converged=False), 1.0, tuple(weights.tolist()), 0.02, tolerance) is None
 
@@ -432,6 +434,10 @@ def _claimed(**parts: tuple[float, float]) -> dict[str, Estimate]:
         ({"antiresonance_hz": (97.9, 0.01), "resonance_hz": (100.0, 0.01)}, ""),
         ({"antiresonance_hz": (90.0, 2.4), "resonance_hz": (100.0, 0.8)}, "Hz are no 4 standard deviations apart"),
         ({"antiresonance_hz": (90.0, 2.3), "resonance_hz": (100.0, 0.8)}, ""),
+        ({"resonance_hz": (51.0, 0.01), "antiresonance_hz": (50.0, 0.01)}, ""), ({"resonance_zeta": (0.5, 0.0)}, ""),
+        ({"resonance_hz": (100.0, 0.3), "antiresonance_hz": (98.0, 0.4)}, ""), ({"resonance_hz": (100.0, 3.0)}, ""),
+        ({"antiresonance_hz": (80.0, 8.0), "resonance_hz": (200.0, 0.1)}, ""),
+        ({"antiresonance_hz": (10.0, 0.1)}, "10 and 100 Hz are not the pair"),
         ({"resonance_zeta": (0.51, 0.0)}, "the damping 0.51 is above 0.5"), ({"resonance_zeta": (0.49, 0.0)}, ""),
         ({"resonance_hz": (100.0, 3.1)}, "known to 3.1 Hz and zeros at 80 Hz to 1 Hz, limits 3 and 10 %"),
         ({"resonance_hz": (200.0, 5.9)}, ""), ({"antiresonance_hz": (60.0, 5.9)}, ""),
