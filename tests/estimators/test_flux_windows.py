@@ -422,6 +422,25 @@ def test_windows_that_scatter_by_a_percent_take_the_driven_ones_along() -> None:
         assert ("with driven" in found.psi_f.method) is wide
 
 
+def test_the_frame_is_known_as_well_as_both_parts_of_the_flux_linkage() -> None:
+    """0.4 rad off, with 3 V of scatter in both voltages: what turns the vector is across it."""
+    trace = _windows()
+    w, x = trace["omega_e_rad_s"], 0.5 * trace["omega_e_rad_s"] * T_S
+    share = w * PSI * np.sin(x) / x
+    scatter = 3.0 * np.random.default_rng(10).standard_normal((2, len(trace)))
+    turned = _changed(
+        trace, u_d_v=trace["u_d_v"] + share * math.sin(0.4) + 0.1 * scatter[0],
+        u_q_v=trace["u_q_v"] + share * (math.cos(0.4) - 1.0) + scatter[1],
+    )  # fmt: skip
+    rows = corrected(turned, R, T_S, None, None, 0.0)
+    even, (fit, std, _) = linkage._fit_even(rows, pairs_of(turned)), linkage._fit_d(rows)
+    psi, eps = math.hypot(even.flux_wb, fit[1]), math.atan2(fit[1], even.flux_wb)
+    found = estimate_flux_linkage(turned, R, period_s=T_S).frame_offset
+    parts = math.cos(eps) * std[1] / psi, math.sin(eps) * even.std_wb / psi, linkage.OFFSET_FLOOR_RAD
+    assert found.std == pytest.approx(math.hypot(*parts), rel=EXACT) and parts[1] > 0.5 * parts[0]
+    assert found.value == pytest.approx(eps, rel=EXACT)
+
+
 @pytest.mark.parametrize("off_deg", [29.0, -29.0, 31.0, -31.0, 170.0])
 def test_a_voltage_of_the_magnets_far_off_the_q_axis_is_refused(off_deg: float) -> None:
     trace = _windows()

@@ -394,6 +394,10 @@ def test_the_doubt_of_an_undriven_voltage_is_its_drift_and_the_inverters_error()
     assert (found.n, found.dof) == (24, 22.0) and abs(parts[2]) > 0.01
     with pytest.raises(IdentificationError, match="E_EXCITATION"):
         flux_by_undriven_voltage([coasts[0], coasts[0]], pole_pairs=PAIRS)
+    for still in (_coast(80.0), _coast(-80.0)):  # at rest is neither way
+        resting = replace(still, signals={**still.signals, "theta_M_rad": 0.0 * still.t_s})
+        with pytest.raises(IdentificationError, match="E_EXCITATION"):
+            flux_by_undriven_voltage([still, resting], pole_pairs=PAIRS)
     assert voltage_drift(_coast(80.0, late=0.9)) == pytest.approx(-0.1, rel=1e-6)
 
 

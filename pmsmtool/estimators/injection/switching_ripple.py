@@ -111,7 +111,7 @@ def ripple_at_edges(
         Link, inductances and period.
     """
     width = off_s - on_s
-    applied = (width - np.mean(width, axis=0)) / modulation.period_s
+    applied = width / modulation.period_s
     angle = theta_rad - LEG_ANGLES[:, None]
     c, s = np.cos(angle), np.sin(angle)
 
@@ -119,7 +119,7 @@ def ripple_at_edges(
         found = np.empty_like(time_s)
         for x in range(3):
             conducted = np.clip(time_s[x] - on_s, 0.0, width)
-            flux = modulation.U_dc_v * (conducted - np.mean(conducted, axis=0) - applied * time_s[x])
+            flux = modulation.U_dc_v * (conducted - applied * time_s[x])  # all legs alike make no vector
             i_d, i_q = np.sum(c * flux, axis=0) / modulation.L_h[0], -np.sum(s * flux, axis=0) / modulation.L_h[1]
             found[x] = 2.0 / 3.0 * (c[x] * i_d - s[x] * i_q)
         return found
