@@ -24,20 +24,22 @@ GROWTH = 8.0
 LOOK_S, WINDOW_S, WINDOW_COUNTS = 0.15, 0.03, 4.0
 """A look at the demand, and the window of a speed in it; fewer counts of the position are no speed."""
 TRIAL_SHARE = 0.25
-"""Speed of the trial moves, of the one asked for; half of sqrt(way x acceleration) at most: it is even then."""
+"""Speed of the trial moves, of the one asked for, more where their ramp would not be seen; half of sqrt(way x
+acceleration) at most: it is even then."""
 FLAT = 0.1
 """Change of the demanded speed between two windows that is none (relative)."""
 LOOKS, MOVES = 60, 10
 SPEED_WITHIN, RAMP_WITHIN = 0.03, 0.08
 """What is asked for is reached within this (relative)."""
-SHORTEST_RAMP_S = 4e-3
-"""Ramps that are shorter are not seen in samples of a millisecond."""
+SHORTEST_RAMP_S, SEEN_RAMP_S = 4e-3, 12e-3
+"""Ramps that are shorter are not seen in samples of a millisecond; one that is seen within ``RAMP_WITHIN``."""
 FURTHEST = 64.0
 """Ramps are changed by no more than this between two moves."""
 LONGEST_S = 20.0
 REST_S, RESTS = 0.1, 10
-ARRIVED, NEAR = 0.02, 0.1
-"""Where a demand has arrived and where a shaft has followed, from the end of the move, of its way."""
+ARRIVED, NEAR, ENOUGH_WAY = 0.02, 0.1, 0.5
+"""Where a demand has arrived, where a shaft has followed, and where a look would end before its speed is seen: from the
+end of the move, of its way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +64,8 @@ def find_profile(
     """Leave counts in the drive with which it moves as is asked for, and return what they are worth.
 
     The drive is enabled and sends its demand; the shaft moves between where it stands and ``way_rad``, at a quarter of
-    the speed or less, and rests where it began. The guard brings the old counts back.
+    the speed, or faster where its ramp would not be seen, and rests where it began. The guard brings the old counts
+    back.
 
     Raises
     ------
@@ -71,7 +74,8 @@ def find_profile(
     DriveTimeout
         A move does not end.
     """
-    slow = min(TRIAL_SHARE * speed_rad_s, 0.5 * math.sqrt(abs(way_rad) * acceleration_rad_s2))
+    slow = min(speed_rad_s, max(TRIAL_SHARE * speed_rad_s, SEEN_RAMP_S * acceleration_rad_s2))
+    slow = min(slow, 0.5 * math.sqrt(abs(way_rad) * acceleration_rad_s2))
     slow = min(slow, acceleration_rad_s2 * LOOK_S / 3.0)  # even at the end of a look
     trial = _Trial(guard, drive, way_rad, acceleration_rad_s2)
     trial.find_speed(slow)
@@ -123,8 +127,9 @@ class _Trial:
 
     def _look(self) -> tuple[float, bool, float]:
         """Move for a short while; return the largest speed, whether it was even, and how fast it rose."""
-        if abs(self._drive.demanded_rad() - self._target) < ARRIVED * abs(self._way):
+        if abs(self._drive.demanded_rad() - self._target) < ENOUGH_WAY * abs(self._way):
             self._rest()
+        if abs(self._drive.demanded_rad() - self._target) < ARRIVED * abs(self._way):
             self._target = self._way - self._target
         self.lend()
         began = self._drive.samples
@@ -178,10 +183,11 @@ class _Trial:
         return self._drive.demand_since(began)
 
     def _rest(self) -> None:
-        """Wait until the shaft has followed: a demand that turns round before takes the lag for a fault."""
+        """Wait until demand and shaft are there: a demand that turns round before takes the lag for a fault."""
         for _ in range(RESTS):
             self._guard.wait(REST_S)
-            if abs(self._drive.lag_rad()) < NEAR * abs(self._way):
+            left = abs(self._drive.demanded_rad() - self._target)
+            if max(left, abs(self._drive.lag_rad())) < NEAR * abs(self._way):
                 return
 
     @property

@@ -19,6 +19,7 @@ from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
+from pmsmtool.units import rad_s_from_rpm
 from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import COMMON, HEARTBEAT, Row, epos4, faulhaber, identity, unknown, write_eds
 
@@ -33,6 +34,8 @@ MOST = 0.5
 RATED_APK = 6.08
 MOST_CURRENT = 0.95
 """Largest current of a designed move over the limit in force; measured 0.90."""
+PROFILE_WITHIN = 0.03
+"""Speed of the drive's own profile from the one asked for, a third of its acceleration; measured 0.004 and 0.005."""
 
 
 @pytest.fixture
@@ -256,3 +259,26 @@ def test_a_move_of_a_design_keeps_within_the_limit_in_force(tool: Tool) -> None:
     assert json.loads(printed)["move"]["current_peak_a"] < MOST_CURRENT * RATED_APK
     torque = J * json.loads(printed)["profile"]["acceleration_rad_s2"]
     assert torque < 0.65 * load_machine_file("interior-2k2").machine.torque_nm(0.0, RATED_APK), "1.2 with I_max"
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("speed_rpm", [100.0, 1000.0])
+def test_half_a_turn_at_any_speed_on_a_drive_whose_profile_has_no_unit(tool: Tool, speed_rpm: float) -> None:
+    """600 rad/s2: the ramp of 26 rpm was too short to be seen, the way to 1000 rpm was over before a look ended."""
+    asked = (
+        "--by",
+        "180deg",
+        "--speed",
+        f"{speed_rpm}rpm",
+        "--acceleration",
+        "600",
+        "--map",
+        "epos2",
+        "--yes",
+        "--json",
+    )
+    code, printed, said = tool("move", *asked, "--sim", "interior-2k2?drive=epos2&nv=:memory:")
+    assert code == 0, said
+    profile = json.loads(printed)["profile"]
+    assert abs(profile["speed_rad_s"] / rad_s_from_rpm(speed_rpm) - 1.0) < PROFILE_WITHIN
+    assert abs(profile["acceleration_rad_s2"] / 600.0 - 1.0) < 3.0 * PROFILE_WITHIN
