@@ -335,6 +335,31 @@ def test_the_solution_keeps_priors_and_the_flux_of_the_magnets() -> None:
     assert SPLINE.flux(x[:k], *at) == pytest.approx(expected + np.array([[shift], [0.0]]), abs=2e-4)  # measured 3e-5
 
 
+@pytest.mark.parametrize("align", [False, True])
+def test_a_fit_begins_with_what_others_know_and_turns_onto_its_axis(
+    monkeypatch: pytest.MonkeyPatch, align: bool
+) -> None:
+    """Each of three turns takes off the angle of the axis; R to a percent, the delay to a tenth of a period."""
+    pulses = SimpleNamespace(i=np.array([[-5.0, 5.0], [-4.0, 4.0]]), volt_seconds=np.array([[0.0, 0.1], [0.0, 0.1]]))
+    given: list[Any] = []
+    for name, answer in (
+        ("integrate_pulses", pulses), ("normal_equations", None), ("_unit", 1.0), ("_by_inductance", None),
+        ("_solve", (np.zeros(900), np.zeros((1, 1)))), ("_symmetry", (0.0, 0.0, 0.02)),
+    ):  # fmt: skip
+        monkeypatch.setattr(map_fit, name, lambda *_, answer=answer: answer)
+    monkeypatch.setattr(map_fit, "_fine_fit", lambda *arguments: given.extend(arguments))
+    curve = InverterCurve(np.array([0.5, 4.0]), np.array([0.8, -1.5]), 0.0)
+    trace = _trace(np.arange(2.0), {"control_period_s": 2e-4}, i_d_a=np.zeros(2))
+    map_fit.fit_coenergy(
+        [trace], Frame(2, 0.1, 0.2), curve, R_ohm=0.6, sigma_a=0.01, magnet=MagnetFlux(0.2, 0.0), align=align
+    )
+    frame, priors = given[2], given[4]
+    assert priors.mean == (0.6, 1.0, 0.0, 0.0, 0.0, 0.0)
+    assert priors.std == pytest.approx((0.006, 0.1, 0.45, 0.45, 0.45, 2e-5), rel=1e-6)
+    assert frame.offset_rad == pytest.approx(0.2 - (0.06 if align else 0.0), rel=EXACT)
+    assert frame.drive_offset_rad == 0.1
+
+
 # ---- flux by voltage over speed ---------------------------------------------------------------------------------
 
 PAIRS, PSI, EPS = 3, 0.05, 0.1
