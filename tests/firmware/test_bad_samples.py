@@ -69,6 +69,54 @@ def test_one_bad_period_holds_the_voltage_and_a_second_latches(name: str) -> Non
     assert loop.output.gates == 1 and loop.state.fault == 0
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_sizes_count_together_and_each_alone(sign: float) -> None:
+    """1e7 in all; angles up to 4000 rad with what the delay adds; less than half a turn in a period."""
+    names = [name for name in (*SAMPLED, *ASKED) if name not in ("theta_e", "omega_e", "mode", "bias_bandwidth")]
+    loop = running()
+    m, r, T_s = loop.measurement, loop.reference, loop.plant.T_s
+
+    def is_held(**changes: float) -> bool:
+        kept = {}
+        for name, value in changes.items():
+            target = m if name in SAMPLED else r
+            kept[name] = target, getattr(target, name)
+            setattr(target, name, value)
+        loop.state.bad_periods = loop.state.fault = 0
+        loop.binding.library.pmsm_step(loop.state, loop.params, None, m, r, loop.output)
+        for name, (target, value) in kept.items():
+            setattr(target, name, value)
+        return bool(loop.state.live.flags & FLAG_HELD)
+
+    for one, other in zip(names, [*names[1:], names[0]], strict=True):
+        assert is_held(**{one: sign * 1.1e7}), one
+        assert is_held(**{one: sign * 0.6e7, other: -0.6e7}), (one, other)
+        assert not is_held(**{one: sign * 1e6}), one
+    assert is_held(bias_bandwidth=1.1e7) and is_held(bias_bandwidth=5e-4) and is_held(mode=7)
+    assert not is_held(bias_bandwidth=2e-3) and not is_held(bias_bandwidth=0.0)
+    assert is_held(theta_e=sign * 4001.0, omega_e=0.0) and not is_held(theta_e=sign * 3999.0, omega_e=0.0)
+    delay = loop.values["inverter.delay_periods"]
+    assert is_held(theta_e=sign * 3999.0, omega_e=-2.0 / (delay * T_s))
+    assert is_held(omega_e=sign * 1.01 * math.pi / T_s) and not is_held(omega_e=sign * 0.99 * math.pi / T_s)
+
+
+def test_a_first_period_knows_the_speed_and_changed_parameters_keep_it() -> None:
+    loop = Loop(core(), tuned(), omega=100.0)
+    loop.step(mode=MODE_OFF)
+    omega = 100.0 / loop.values["motor.pole_pairs"]
+    assert loop.state.omega_filtered == pytest.approx(omega) == loop.state.omega_ref_ramped
+    loop.step(mode=MODE_CURRENT)
+    loop.state.omega_ref_ramped = 3.0
+    loop.params.inverter_T_s_ns = 100_000
+    before = loop.state.derived.T_s
+    loop.binding.library.pmsm_parameters_changed(loop.state)
+    loop.step(mode=MODE_CURRENT)
+    assert loop.state.omega_ref_ramped == 3.0 and loop.state.derived.T_s == pytest.approx(1e-4) != before
+    fresh = loop.binding.state()
+    loop.binding.library.pmsm_parameters_changed(fresh)
+    assert fresh.prepared == 0, "the first period is still to come"
+
+
 def test_no_temperature_sensor_is_no_bad_sample() -> None:
     loop = running()
     for _ in range(5):

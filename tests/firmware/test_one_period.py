@@ -217,6 +217,14 @@ def gain32(gain: float) -> float:
     return float(np.float32(gain))
 
 
+def test_a_torque_that_no_current_makes_asks_for_none() -> None:
+    for L_q, psi, i_d, there in ((0.02, 0.0, 0.0, 0.0), (0.02, 0.01, 30.0, 0.0), (0.02, 0.01, -30.0, 1.0)):
+        loop, v = loop_of(motor__psi_f_wb=psi, motor__L_q_app_h=L_q, field_weakening__i_d_lm_a=i_d)
+        live = loop.step(mode=MODE_TORQUE, tau_ref=2.0)
+        flux = v["motor.psi_f_wb"] + (v["motor.L_d_app_h"] - v["motor.L_q_app_h"]) * i_d
+        close(live.i_q_req, there * 2.0 / (1.5 * v["motor.pole_pairs"] * flux) if there else 0.0)
+
+
 def test_the_notch_is_the_bilinear_one() -> None:
     loop, v = loop_of(
         speed__notch_hz=300.0, speed__notch_zeta_num=0.05, speed__notch_zeta_den=0.4, speed__decimation=2,

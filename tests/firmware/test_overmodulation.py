@@ -105,6 +105,32 @@ def test_a_leg_leaves_the_lower_switch_its_time_and_shunts_their_window() -> Non
     assert (1.0 - plain[:, 1].max()) * T_S_NS < off + TIMES, "without shunts the second leg goes as far as the first"
 
 
+@pytest.mark.parametrize("shunts", [0, 1, 3])
+@pytest.mark.parametrize(
+    ("T_ns", "off", "window"),
+    [(100_000, 0, 0), (100_000, 2000, 5000), (100_000, 4000, 3000), (25_000, 20_000, 2000), (25_000, 1000, 11_250)],
+)
+def test_what_the_times_of_a_leg_leave(shunts: int, T_ns: int, off: int, window: int) -> None:
+    """Of duties, of the linear range and of an edge's halves; six steps of what is left (docs/control.md, 8)."""
+    times = {"min_off_time_ns": off, "sample_window_ns": window, "shunts": shunts, "T_s_ns": T_ns}
+    for governor, share in ((0, 1.005), (5, 1.005), (BEST, 0.99)):
+        values = tuned(governor__mode=governor, **{f"inverter__{key}": value for key, value in times.items()})
+        loop = Loop(core(double=True), values, omega=0.0)
+        loop.step(mode=MODE_CURRENT)
+        d = loop.state.derived
+        most = max(1.0 - off / T_ns, 0.5)
+        second = max(1.0 - window / T_ns, 0.6 * most) if shunts == 3 else most
+        apart = min(2.0 * window / T_ns, 0.4 * most) if shunts == 1 else 0.0
+        low, high = 1.0 - 2.0 * apart / most, (2.0 * min(second, most) / most - 1.0) - 2.0 * apart / most
+        assert [d.duty_most, d.second_duty_most, d.duties_apart] == pytest.approx([most, min(second, most), apart])
+        assert d.shunts == (shunts if window else 0)
+        assert [d.side_low, d.side_high] == pytest.approx(np.array([low, high]) / math.sqrt(3.0))
+        assert d.over_most == pytest.approx(3.0 / math.pi + (math.sqrt(3.0) - 1.5) / math.pi * (low + high), abs=1e-6)
+        assert d.over_rate == pytest.approx(6.0 * math.pi * math.sqrt(3.0) / (low**3 + high**3))
+        assert d.utilisation_linear == pytest.approx(most / math.sqrt(3.0), rel=3e-5)
+        assert d.held_share == share
+
+
 def test_the_legs_make_the_nearest_point_of_the_hexagon() -> None:
     """Of a longer demand in the same direction: tried against a fine search along the hexagon's outline."""
     corners = 2.0 / 3.0 * U_DC * np.exp(1j * math.pi / 3.0 * np.arange(7))

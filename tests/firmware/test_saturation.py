@@ -165,6 +165,8 @@ def words_of(changes: dict[int, float], **descriptor: float) -> tuple[dict[str, 
         ({195: math.inf}, {}),
         ({}, {"n_d": 1.0}),
         ({}, {"n_q": 1.0}),
+        ({}, {"n_d": 0.0}),
+        ({}, {"n_q": 0.0}),
         ({}, {"i_q_max_a": 0.0}),
         ({}, {"i_d_min_a": 0.0, "i_d_max_a": 0.0}),
         ({}, {"n_d": 6.0}),
@@ -179,8 +181,8 @@ def test_c_and_python_refuse_the_same_tables(changes: dict[int, float], descript
     image = (
         image[: 4 * row] + struct.pack("<2I", *(int(values[f"saturation.n_{a}"]) for a in "dq")) + image[4 * row + 8 :]
     )
-    of_one_row = 1.0 in descriptor.values()  # as long as it says
-    image += words[: 16 * int(values["saturation.n_d"] * values["saturation.n_q"])] if of_one_row else words
+    no_table = any(descriptor.get(f"n_{axis}", 2.0) < 2.0 for axis in "dq")  # as long as it says
+    image += words[: 16 * int(values["saturation.n_d"] * values["saturation.n_q"])] if no_table else words
     with pytest.raises(ImageRefused) as caught:
         unpack_image(image)
     assert core().library.pmsm_image_check_content(image, len(image)) == caught.value.status
