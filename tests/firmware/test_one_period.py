@@ -350,3 +350,41 @@ def test_the_current_of_the_harmonics_is_taken_out(delay: float) -> None:
         sampled = 2 / 3 * np.array(phases) @ np.exp(1j * THIRD * np.arange(3)) * np.exp(-1j * theta)
         close([live.i_d, live.i_q], [sampled.real, sampled.imag])
         close(dq(state.current_before), [sampled.real, sampled.imag] - (i - mean))
+
+
+def looked_up(torque: list[float], points: list[tuple[float, float]], tau: float, **changes: float) -> np.ndarray:
+    """Request for a torque from a table of one speed and link."""
+    cells = np.repeat(np.array(points, dtype=float)[:, None, :], 2, axis=1)
+    parts = (torque, [-1e4, 1e4], [300.0], cells[..., 0], cells[..., 1])
+    lut = b"".join(np.asarray(part, dtype=np.float32).tobytes() for part in parts)
+    descriptor = {"lut__format": 1, "lut__n_x": len(torque), "lut__n_y": 2, "lut__n_z": 1}
+    loop, _ = loop_of(lut=lut, field_weakening__mode=1, field_weakening__i_d_min_a=-7.0, motor__I_max_apk=8.0,
+                      protection__I_cont_apk=8.0, **descriptor, **changes)  # fmt: skip
+    loop.state.lut_cut = 0
+    live = loop.step(mode=MODE_TORQUE, tau_ref=tau)
+    return np.array([live.i_d_req, live.i_q_req])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_torque_is_cut_where_the_way_from_none_leaves_the_limit(sign: float) -> None:
+    """Between nodes either side of no torque; where even that takes more than the limit, i_d keeps its share."""
+    way, share = np.array([-4.0, 12.0]), 0.25  # of the cell from -10 to 30 N m: no torque
+    points = [np.zeros(2) - share * way, (1.0 - share) * way]
+    order = 1 if sign > 0 else -1
+    torque = [sign * x for x in (-10.0, 30.0)][::order]
+    nodes_ = [(p[0], sign * p[1]) for p in points][::order]
+    found = looked_up(torque, nodes_, sign * 29.0)
+    close(found, np.array([way[0], sign * way[1]]) * 8.0 / math.hypot(*way))
+    shifted = [(p[0] - 6.0, p[1] + sign * 6.0) for p in nodes_]  # no torque takes (-6, 6) A
+    inside = (shifted[0] if sign > 0 else shifted[-1])[1] * sign
+    assert inside < 6.0
+    found = looked_up(torque, shifted, sign * 29.0)
+    close(found, [-6.0, sign * math.sqrt(8.0**2 - 36.0)])
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_without_a_point_inside_the_limit_the_voltage_has_its_current(sign: float) -> None:
+    hole = (math.nan, math.nan)
+    torque = [sign * x for x in (0.0, 10.0, 20.0)][:: int(sign)]
+    points = [hole, (-9.0, sign * 9.0), (-9.0, sign * 19.0)][:: int(sign)]
+    close(looked_up(torque, points, sign * 15.0), [-7.0, 0.0])
