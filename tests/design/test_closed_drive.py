@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from pmsmtool.cli.main import cli
 from pmsmtool.design.closed_drive import (
     CURRENT,
+    CURRENT_GAINS,
     GAINS,
     RATED,
     SLOPE,
@@ -23,9 +24,15 @@ from pmsmtool.design.closed_drive import (
     TORQUE,
     ClosedDrive,
     Guarantee,
+    _as_controlled,
+    _Projection,
+    current_loops,
     tune_closed,
 )
 from pmsmtool.design.design_file import Design, design_text, parse_design
+from pmsmtool.design.ratings import ratings
+from pmsmtool.design.tolerance import tolerance_box
+from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, NotAvailable
@@ -117,6 +124,45 @@ def test_the_figure_keeps_its_promises() -> None:
     assert {row[1] for row in rows if row[4] == 0} >= {"closed, limits"}
     lost = [row[7] for row in rows if row[1] == "closed, limits"]
     assert all(isinstance(value, float) and value > 0.0 for value in lost)  # a guarantee costs torque
+
+
+def test_limits_of_the_search_are_the_ends_of_the_intervals() -> None:
+    """Low link, dead time at the high one; least torque per ampere, least inertia, most flux to accelerate it."""
+    source = machine(J_kgm2=2e-3)
+    request, stated = TuneRequest(voltage_margin=0.1), bandwidth(source)
+    drive = ClosedDrive("test", OFFERS, stated)
+    rated = ratings(source, 0.9 * source.inverter.V_max_v)
+    design = _as_controlled(tune(source, request), drive)
+    m, inverter, alpha = source.machine, source.inverter, 2.0 * math.pi * stated
+    assert [design[name] for name in CURRENT_GAINS] == pytest.approx(
+        [alpha * m.L_d_h, alpha * m.R_s_ohm, alpha * m.L_q_h, alpha * m.R_s_ohm]
+    )
+    found = _Projection(source, rated, request, drive, current_loops(design, drive))
+    box = tolerance_box(source)
+    low, high = box.U_dc_v
+    dead = 4.0 / 3.0 * inverter.dead_time_s / inverter.T_s * high
+    assert found.limit == pytest.approx(0.9 * inverter.voltage_utilisation * low - dead)
+    psi, J = (box.factors[name].half_width for name in ("psi_f_wb", "J_kgm2"))
+    assert found.per_ampere == pytest.approx(1.5 * m.pole_pairs * m.psi_f_wb * (1.0 - psi))
+    assert found.I_top == pytest.approx(min(rated.I_max_apk, rated.tau_max_nm / found.per_ampere))
+    coldest = m.psi_f_wb * (1.0 + m.alpha_psi_per_k * (box.T_magnet_c[0] - m.T_ref_c)) * (1.0 + psi)
+    assert found.box.psi[1] == pytest.approx(coldest)
+    hot, R = 1.0 + m.alpha_R_per_k * (box.T_winding_c[1] - m.T_ref_c), box.factors["R_s_ohm"].half_width
+    assert found.box.R[1] == pytest.approx(m.R_s_ohm * hot * (1.0 + R))
+    torque = 1.5 * m.pole_pairs * coldest * 3.0
+    assert found.acceleration(3.0) == pytest.approx(m.pole_pairs * torque / (2e-3 * (1.0 - J)))
+    known = _Projection(
+        source, rated, request, replace(drive, acceleration_rpm_per_s=600.0), current_loops(design, drive)
+    )
+    assert known.acceleration(3.0) == pytest.approx(600.0 * math.pi / 30.0 * m.pole_pairs)
+    top = found.limit / found.box.psi[0] / m.pole_pairs
+    assert found.responses[0].omega_e[-1] == pytest.approx(m.pole_pairs * min(top, rated.n_max_rpm * math.pi / 30.0))
+
+
+def test_without_a_speed_asked_for_the_power_is_the_largest() -> None:
+    _, found = made(machine())
+    best = int(np.argmax(found.closed_nm * found.speeds_rpm))
+    assert (found.n_rpm, found.tau_nm) == pytest.approx((found.speeds_rpm[best], found.closed_nm[best]))
 
 
 def test_what_it_costs_is_said() -> None:
