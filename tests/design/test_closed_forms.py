@@ -15,10 +15,12 @@ from pmsmtool.design.headroom import HeadroomLimits, OperatingCells, headroom
 from pmsmtool.design.loops.current_loop import second_order
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import (
+    SpeedGains,
     SpeedMethod,
     companion,
     pole_placement,
     small_time_constants,
+    speed_loop,
     symmetric_ratio,
 )
 from pmsmtool.design.minimum_time import Flow
@@ -106,6 +108,9 @@ def test_the_speed_loop_of_a_design_is_that_of_its_method() -> None:
         assert placed["speed.K_p_nms_per_rad"] == pytest.approx(2.0 * zeta * w * J - B, rel=1e-9)
         assert placed["speed.K_i_nm_per_rad"] == pytest.approx(w**2 * J, rel=1e-9)
     slow = path()
+    assert speed_loop(SpeedGains(1.0, 1.0, 1.0, SpeedMethod.SYMMETRIC_OPTIMUM), slow).delay_s == pytest.approx(
+        slow.current.delay_s + 0.5 * slow.T_speed
+    )
     assert small_time_constants(slow, 500.0) - small_time_constants(slow, 1000.0) == pytest.approx(1e-3)
 
 

@@ -95,6 +95,10 @@ def test_sizes_count_together_and_each_alone(sign: float) -> None:
     assert is_held(bias_bandwidth=1.1e7) and is_held(bias_bandwidth=5e-4) and is_held(mode=7)
     assert not is_held(bias_bandwidth=2e-3) and not is_held(bias_bandwidth=0.0)
     assert is_held(theta_e=sign * 4001.0, omega_e=0.0) and not is_held(theta_e=sign * 3999.0, omega_e=0.0)
+    nothing = dict.fromkeys(("i_a", "i_b", "i_c", "T_winding", "i_q_ref"), 0.0)
+    assert not is_held(U_dc=sign * 1e7, **nothing) and is_held(U_dc=sign * 1.0001e7, **nothing)
+    assert not is_held(theta_e=sign * 4000.0, omega_e=0.0)
+    assert not is_held(bias_bandwidth=1e-3)
     delay = loop.values["inverter.delay_periods"]
     assert is_held(theta_e=sign * 3999.0, omega_e=-2.0 / (delay * T_s))
     assert is_held(omega_e=sign * 1.01 * math.pi / T_s) and not is_held(omega_e=sign * 0.99 * math.pi / T_s)

@@ -88,6 +88,7 @@ def table(
     torque = np.cumsum(rng.uniform(3, 9, 9)).astype(f)
     torque += f(first) - (f(0) if first else torque[0])
     second = np.cumsum(rng.uniform(0.8, 2.0, 7)).astype(f) * f(100 if kind == 0 else 0.05)
+    second -= second[0] if kind == 0 else f(0)  # a table of speeds begins at standstill
     volts = np.array([180, 210, 260], dtype=f)[:n_z]
     shape = (len(torque), len(second), n_z)
     lsb = 0.002

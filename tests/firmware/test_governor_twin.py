@@ -54,7 +54,11 @@ CASES = {
     ),
     "line search, current row": (
         reference_case(
-            7540.0, governor__mode=LINE, governor__eps=0.001, governor__options=CURRENT_ROW | PRE_PROJECTION
+            7540.0,
+            governor__mode=LINE,
+            governor__eps=0.001,
+            governor__slack=0.02,
+            governor__options=CURRENT_ROW | PRE_PROJECTION,
         ),
         900.0,
     ),

@@ -154,7 +154,7 @@ def test_the_minimum_time_direction(law: str) -> None:
     changes: dict[str, float] = {
         "governor__options": MINIMUM_TIME | (PREDICTOR if law == "predicted" else 0),
         "governor__I_transient_apk": 300.0,
-        "inverter__delay_periods": 1.5 if law in ("predicted", "late") else 0.5,
+        "inverter__delay_periods": {"predicted": 1.5, "late": 1.0}.get(law, 0.5),
     }
     if law == "saturated":
         loop, _ = saturated(governor__mode=BEST, inverter__voltage_utilisation=1 / math.sqrt(3), **changes)

@@ -13,10 +13,12 @@ from scipy.signal import bilinear, lfilter
 
 from pmsmtool.firmware.core_binding import core
 from tests.firmware.closed_loop import (
+    BEST,
     FLAG_CURRENT,
     FLAG_DUTY,
     FLAG_I2T,
     FLAG_VOLTAGE,
+    HEXAGON,
     MODE_CURRENT,
     MODE_SPEED,
     MODE_TORQUE,
@@ -121,10 +123,10 @@ def test_a_destroyed_node_leaves_the_magnetics_and_at_first_those_of_the_paramet
             assert (loop.state.local.L_d, loop.state.local.L_q_app) == before
 
 
-@pytest.mark.parametrize("options", [23, 16, 17, 20])
-def test_the_predictor_and_what_the_integrators_see(options: int) -> None:
+@pytest.mark.parametrize(("options", "delay"), [(23, 1.5), (16, 1.5), (17, 1.0), (20, 1.0)])
+def test_the_predictor_and_what_the_integrators_see(options: int, delay: float) -> None:
     """The stator flux under the voltage that acts, R_s i at the mean current of the period."""
-    loop, v = loop_of(U_dc=150.0, current__options=options, inverter__delay_periods=1.5)
+    loop, v = loop_of(U_dc=150.0, current__options=options, inverter__delay_periods=delay)
     rng, state, plant = np.random.default_rng(4), loop.state, loop.plant
     T_s, R = plant.T_s, v["motor.R_s_ohm"]
     L, app = (np.array([v[f"motor.L_{axis}{kind}_h"] for axis in "dq"]) for kind in ("", "_app"))
@@ -270,6 +272,7 @@ def test_the_thermal_budget_of_a_current() -> None:
         seen.add((exhausted, budget in (0.0, 1.0)))
     assert len(seen) == 4
     loop, _ = loop_of(motor__I_max_apk=40.0, protection__I_cont_apk=20.0, motor__I_max_time_s=0.0)
+    assert loop.state.derived.i2t_rate == 0.0
     close(loop.step(mode=MODE_CURRENT, i_q_ref=35.0).i_q_req, 20.0)
     loop, _ = loop_of(motor__I_max_apk=20.0, protection__I_cont_apk=40.0, motor__I_max_time_s=0.0)
     close(loop.step(mode=MODE_CURRENT, i_q_ref=35.0).i_q_req, 20.0)
@@ -329,7 +332,7 @@ def test_at_the_voltage_limit_weakening_leaves_i_q_its_share() -> None:
     close([live.i_d_req, live.i_q_req], [-10.0, 0.0])
 
 
-@pytest.mark.parametrize("delay", [0.5, 1.5])
+@pytest.mark.parametrize("delay", [0.5, 1.0, 1.5])
 def test_the_current_of_the_harmonics_is_taken_out(delay: float) -> None:
     loop, v = loop_of(inverter__voltage_utilisation=0.63, inverter__delay_periods=delay, current__options=0)
     state, plant, rng = loop.state, loop.plant, np.random.default_rng(9)
@@ -388,3 +391,48 @@ def test_without_a_point_inside_the_limit_the_voltage_has_its_current(sign: floa
     torque = [sign * x for x in (0.0, 10.0, 20.0)][:: int(sign)]
     points = [hole, (-9.0, sign * 9.0), (-9.0, sign * 19.0)][:: int(sign)]
     close(looked_up(torque, points, sign * 15.0), [-7.0, 0.0])
+
+
+def at_rest(**changes: float) -> Loop:
+    """A loop whose angle, speed and current are exactly zero."""
+    loop, _ = loop_of(omega=0.0, **changes)
+    loop.plant.theta, loop.plant.i = 0.0, np.zeros(2)
+    return loop
+
+
+def test_what_is_exactly_at_a_limit_is_within_it() -> None:
+    """Numbers that binary arithmetic meets exactly: 3, 4, 5; duties of 0 and 1; a current at its bound."""
+    loop = at_rest(motor__I_max_apk=5.0, protection__I_cont_apk=5.0)
+    live = loop.step(mode=MODE_CURRENT, i_d_ref=3.0, i_q_ref=4.0)
+    assert (live.i_d_req, live.i_q_req, live.flags & FLAG_CURRENT) == (3.0, 4.0, 0)
+    assert loop.state.derived.i2t_rate == 0.0 and loop.state.derived.saturates == 0
+    loop = at_rest(current__options=8)
+    live = loop.step(mode=MODE_VOLTAGE, u_d_inject=200.0, u_q_inject=0.0)
+    assert (loop.output.duty_a, loop.output.duty_b, loop.output.duty_c) == (1.0, 0.0, 0.0)
+    assert not live.flags & FLAG_DUTY
+    assert loop.step(mode=MODE_VOLTAGE, u_d_inject=200.1).flags & FLAG_DUTY
+    loop = at_rest(field_weakening__i_d_min_a=-8.0, field_weakening__i_d_lm_a=-8.0)
+    live = loop.step(mode=MODE_TORQUE, tau_ref=0.0)
+    assert (live.i_d_req, live.flags & FLAG_CURRENT) == (-8.0, 0)
+
+
+@pytest.mark.parametrize("U_dc", [0.0, 1e-3, -5.0])
+def test_no_link_voltage_makes_no_duties(U_dc: float) -> None:
+    for changes in ({}, {"governor__mode": BEST}, {"polar__mode": 6}, {"inverter__voltage_utilisation": 0.63}):
+        loop = at_rest(**changes)
+        loop.measurement.U_dc = U_dc
+        live = loop.step(mode=MODE_CURRENT, i_q_ref=3.0)
+        out = loop.output
+        assert (out.duty_a, out.duty_b, out.duty_c, loop.state.fault) == (0.5, 0.5, 0.5, 0)
+        assert live.i_q_ref == 3.0 and loop.state.polar.delta == 0.0
+
+
+def test_a_hexagon_without_a_demand_and_a_request_that_stands_still() -> None:
+    loop = at_rest(governor__mode=BEST, governor__options=HEXAGON, governor__observer_gain=0.0)
+    live = loop.step(mode=MODE_CURRENT, i_d_ref=0.0, i_q_ref=0.0)
+    assert (loop.output.duty_a, live.kappa, live.i_q_ref) == (0.5, 1.0, 0.0)
+    asked = loop.step(mode=MODE_CURRENT, i_q_ref=90.0).i_q_req
+    put(loop.state.reference_held, np.array([0.0, asked]))
+    loop.plant.i = np.zeros(2)
+    live = loop.step(mode=MODE_CURRENT, i_q_ref=90.0)
+    assert live.i_q_ref < asked and live.kappa == 0.0

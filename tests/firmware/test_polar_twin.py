@@ -68,7 +68,7 @@ CASES = {
     "regularised": (values(REGULARISED, polar__b=0.5), -400.0, 6.0),
     "regularised, interior, delay": (values(REGULARISED, PREDICT, inverter__delay_periods=1.5, **SALIENT), 500.0, 8.0),
     "unified": (values(UNIFIED, polar__V_ref_ratio=0.97), 900.0, 14.0),
-    "unified, delay": (values(UNIFIED, PREDICT, inverter__delay_periods=1.5), -1000.0, 12.0),
+    "unified, delay": (values(UNIFIED, PREDICT, inverter__delay_periods=1.0), -1000.0, 12.0),
     "unified, interior, limits": (values(UNIFIED, polar__V_ref_ratio=0.97, **SALIENT), 1300.0, 38.0),
     "unified, interior, torque": (
         values(UNIFIED, polar__V_ref_ratio=0.97, field_weakening__i_d_lm_a=-2.0, **SALIENT),
