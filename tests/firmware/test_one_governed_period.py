@@ -22,6 +22,8 @@ from tests.firmware.closed_loop import (
     MODE_CURRENT,
     MODE_TORQUE,
     OBSERVE,
+    PAPER,
+    PRE_PROJECTION,
     PREDICTOR,
     RPM,
     Loop,
@@ -265,3 +267,41 @@ def test_a_transfer_waits_while_the_look_up_searches() -> None:
             u = 8.0 * request + x + [0.0, loop.plant.omega * loop.params.motor_psi_f_wb]
             V = loop.params.inverter_voltage_utilisation * V_DC
             assert [live.u_d, live.u_q] == pytest.approx(u * V / math.hypot(*u), abs=1e-4)
+
+
+class Hasty(Table1):
+    """Integrators that do not cancel the plant's pole: the largest voltage may be a predicted one."""
+
+    @property
+    def gains(self) -> tuple[float, float, float]:
+        return self.alpha * self.L_d, self.alpha * self.L_q, 60.0 * self.alpha * self.R
+
+
+def test_a_request_passes_where_all_rows_of_the_paper_admit_it() -> None:
+    """Along its own trajectory, whatever the integrators hold: as (20) and (27) say of row after row."""
+    k_max, eps = 6, 0.01
+    K_i = {f"current__K_i_{axis}_v_per_as": Hasty().gains[2] for axis in "dq"}
+    loop, rng = governed(PAPER, governor__eps=eps, governor__k_max=k_max, **K_i), np.random.default_rng(6)
+    machine, seen = Hasty(T_s=loop.plant.T_s), []
+    for _ in range(200):
+        omega = loop.plant.omega = float(rng.uniform(-700, 700)) * RPM
+        way = math.copysign(1.0, omega)  # integrators ahead of the EMF, the error against it: larger voltages later
+        i = loop.plant.i = rng.uniform(-20, 20, 2)
+        x = put(loop.state.integrator, np.array([rng.uniform(-30, 30), way * rng.uniform(-10, 90)]))
+        target = i + rng.uniform(-1, 1, 2) * rng.choice([2.0, 9.0]) - [0.0, way * rng.uniform(-5, 20)]
+        live = loop.step(mode=MODE_CURRENT, i_d_ref=target[0], i_q_ref=target[1])
+        rows = paper_rows(machine, omega, i, x / machine.gains[2], k_max, eps)
+        excess = [math.hypot(*(M @ target + c)) / V - 1.0 for M, c, V in rows]
+        if abs(max(excess)) > 1e-4:
+            assert bool(live.flags & FLAG_ACTIVE) == (max(excess) > 0.0)
+            seen.append(int(np.argmax(excess)) if max(excess) > 0.0 else -1)
+    assert {-1, 0, 1, k_max + 1} <= set(seen)
+
+
+def test_without_a_current_row_the_reachable_request_knows_none() -> None:
+    """A voltage limit below the current, in numbers: 23 V, 40 A."""
+    loop = governed(BEST, governor__options=PRE_PROJECTION, governor__observer_gain=0.0)
+    loop.measurement.U_dc, loop.plant.omega, loop.plant.i = 40.0, 5.0, np.array([0.0, 40.0])
+    put(loop.state.integrator, np.array([0.0, 0.0]))
+    live = loop.step(mode=MODE_CURRENT, i_d_ref=0.0, i_q_ref=40.0)
+    close([live.i_d_ref, live.i_q_ref, live.binding], [0.0, 40.0, NONE])
