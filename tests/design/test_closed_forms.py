@@ -12,7 +12,9 @@ from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
 from pmsmtool.design.headroom import HeadroomLimits, OperatingCells, headroom
+from pmsmtool.design.lookup.design import LookupRequest, _Problem
 from pmsmtool.design.loops.current_loop import second_order
+from pmsmtool.design.loops.margins import BLOCK, BlockTask, evaluate_blocks, margin_problem
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import (
     SpeedGains,
@@ -24,6 +26,7 @@ from pmsmtool.design.loops.speed_loop import (
     symmetric_ratio,
 )
 from pmsmtool.design.minimum_time import Flow
+from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.prediction import (
     FLOOR_SHARE,
     LEAST_FACTOR,
@@ -32,7 +35,7 @@ from pmsmtool.design.prediction import (
     NORMALISING_QUANTILE,
     predict,
 )
-from pmsmtool.design.ratings import ratings, voltage_facts
+from pmsmtool.design.ratings import SAG_SHARE, ratings, voltage_facts
 from pmsmtool.design.tolerance import Samples, tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
@@ -209,3 +212,25 @@ def test_a_band_is_made_of_runs_that_are_left_out_one_by_one() -> None:
         common = max(largest[key].max() / q for key, q in normal.items())
         for key, q in normal.items():
             assert found.bands[key].factor == pytest.approx(max(LEAST_FACTOR, allowance * common * q), rel=1e-9)
+
+
+def test_blocks_have_as_many_samples_as_are_left() -> None:
+    design = tune(SURFACE)
+    task = BlockTask(margin_problem(design), tolerance_box(SURFACE), BLOCK + 17, 1, 0, 2)
+    assert [len(block.values["headroom_voltage"]) for block in evaluate_blocks(task)] == [BLOCK, 17]
+
+
+def test_a_table_of_one_link_reaches_to_the_speed_of_a_sagged_one() -> None:
+    """The drive looks up at n U_dc / U_now; with links of its own, or by flux, it does not."""
+    rated = ratings(SURFACE, 0.92 * SURFACE.inverter.V_max_v)
+    machine = at_temperature(SURFACE.machine, None)
+    tops = {}
+    for axis, U_dc in (("speed", (210.0,)), ("speed", (180.0, 210.0)), ("flux", (210.0,))):
+        request = LookupRequest(axis=axis, U_dc_v=U_dc, n_max_rpm=300.0)
+        (first, uniform), _ = _Problem(machine, SURFACE, rated, request, 0.08).second_axis()
+        tops[axis, len(U_dc)] = first
+        assert first[[0, -1]] == pytest.approx(uniform[[0, -1]])
+    assert tops["speed", 1][-1] == pytest.approx(300.0 / SAG_SHARE)
+    assert tops["speed", 2][-1] == pytest.approx(300.0)
+    V, omega = 0.92 * SURFACE.inverter.voltage_utilisation * 210.0, 300.0 * math.pi / 30.0 * SURFACE.machine.pole_pairs
+    assert tops["flux", 1][0] == pytest.approx(V / omega, rel=1e-6)
