@@ -17,17 +17,14 @@ from pmsmtool.design.lookup import table
 from pmsmtool.design.lookup.design import LookupRequest, _fitting
 from pmsmtool.design.lookup.grid import table_words
 from pmsmtool.design.loops.current_loop import second_order
-from pmsmtool.design.loops.speed_loop import SpeedMethod, companion, pole_placement, symmetric_optimum
-from pmsmtool.design.minimum_time import Flow
+from pmsmtool.design.loops.speed_loop import pole_placement, symmetric_optimum
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.design.polar_map import share_above
 from pmsmtool.design.polar_values import _options
-from pmsmtool.design.prediction import Prediction
-from pmsmtool.design.tune import _notch, _speed_gains, tune
+from pmsmtool.design.tune import _notch, tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.machine_file import load_machine_file
-from tests.design.test_speed_loop import path
 
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "interior-2k2.toml"
 ROUNDING = 1e-12  # relative; measured 2e-16
@@ -85,34 +82,12 @@ def test_a_gain_of_zero_is_refused_with_the_frequency_that_gives_it() -> None:
         symmetric_optimum(1.0, 1e-3, 1.0)
 
 
-def test_speed_gains_of_every_choice() -> None:
-    shown = path()
-    J, B = shown.J, shown.B
-    placed = TuneRequest(speed_method=SpeedMethod.POLE_PLACEMENT, speed_damping=0.8)
-    T_sum = 1.0 / _speed_gains(TuneRequest(speed_phase_margin_deg=45.0), shown, 4000.0).omega_c / (1.0 + math.sqrt(2.0))
-    gains = _speed_gains(replace(placed, speed_bandwidth_hz=7.0), shown, 4000.0)
-    w = 2.0 * math.pi * 7.0
-    assert (gains.K_p, gains.K_i) == pytest.approx((2.0 * 0.8 * w * J - B, w * w * J), rel=ROUNDING)
-    left = _speed_gains(replace(placed, speed_phase_margin_deg=45.0), shown, 4000.0)
-    w = 0.5 / ((1.0 + math.sqrt(2.0)) * T_sum)  # (1 + sin PM) / cos PM
-    assert (left.K_p, left.K_i) == pytest.approx((2.0 * 0.8 * w * J - B, w * w * J), rel=ROUNDING)
-    asked = _speed_gains(TuneRequest(speed_bandwidth_hz=7.0), shown, 4000.0)
-    assert asked.omega_c == pytest.approx(2.0 * math.pi * 7.0, rel=ROUNDING)
-
-
 def test_a_notch_needs_a_rate_that_shows_the_resonance() -> None:
     machine = load_machine_file(PROFILE)
     swings = replace(machine, machine=replace(machine.machine, resonance_hz=50.0, antiresonance_hz=20.0))
     assert _notch(swings, TuneRequest(), 1e-3)[0].hz == 50.0
     notch, _, notes = _notch(swings, TuneRequest(), 20e-3)
     assert notch.hz == 0.0 and notes[0].endswith("rate, 50 Hz")
-
-
-def test_the_integral_of_a_flow_whose_matrix_has_no_inverse() -> None:
-    """A machine at rest without resistance: e^(F t) = 1 + F t, its integral T + F T^2/2."""
-    T = 0.3
-    for F in (np.zeros((2, 2)), np.array([[0.0, 2.0], [0.0, 0.0]])):
-        assert Flow(F).integral(T) == pytest.approx(T * np.eye(2) + 0.5 * T * T * F, abs=ROUNDING)
 
 
 def test_where_the_largest_torque_stays_outside_the_circle() -> None:
@@ -138,16 +113,6 @@ def test_gains_of_the_coefficient_diagram_method() -> None:
     gain = math.cos(delta)
     assert (found.K_P21, found.K_I21) == pytest.approx((K_P / gain, K_I / gain), rel=ROUNDING)
     assert (found.K_P12, found.K_I12) == pytest.approx((-K_P / (V_a * gain), -K_I / (V_a * gain)), rel=ROUNDING)
-
-
-def test_a_realisation_is_of_the_ratio_alone() -> None:
-    found = companion(np.array([2.0, 4.0]), np.array([2.0, 1.0]))
-    assert str(found) == str(companion(np.array([1.0, 2.0]), np.array([1.0, 0.5])))
-
-
-def test_the_signals_of_one_experiment() -> None:
-    bands: Any = {("steps", "i_q_a"): None, ("move", "x"): None, ("steps", "i_d_a"): None}
-    assert Prediction({}, bands).signals("steps") == ("i_q_a", "i_d_a")
 
 
 def test_a_delay_of_one_period_can_be_predicted() -> None:

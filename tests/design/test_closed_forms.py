@@ -13,6 +13,8 @@ from scipy.linalg import expm
 
 from pmsmtool.design.headroom import HeadroomLimits, OperatingCells, headroom
 from pmsmtool.design.lookup.design import LookupRequest, _Problem
+from pmsmtool.design.lookup.grid import GridBounds, _voltage_excess
+from pmsmtool.design.lookup.table import speed_table, torque_limits
 from pmsmtool.design.loops.current_loop import second_order
 from pmsmtool.design.loops.margins import BLOCK, BlockTask, evaluate_blocks, margin_problem
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
@@ -123,17 +125,6 @@ def test_a_loop_that_is_unstable_is_refused_by_its_crossover() -> None:
     assert "crossover 400 Hz is unstable" in str(caught.value)
 
 
-def test_a_notch_is_at_a_resonance_that_the_speed_controller_can_follow() -> None:
-    T_speed = tune(SURFACE)["speed.decimation"] * SURFACE.inverter.T_s
-    for share, there in ((0.05, True), (0.6, False)):
-        hz = share / T_speed
-        source = replace(SURFACE, machine=replace(SURFACE.machine, resonance_hz=hz))
-        design = tune(source, TuneRequest(speed_bandwidth_hz=2.0))
-        assert (design["speed.notch_hz"] == pytest.approx(hz)) == there
-        said = " ".join(design.notes)
-        assert (f"rate, {1.0 / T_speed:.4g} Hz" in said) != there
-
-
 def test_what_a_placement_needs_is_said_with_its_number() -> None:
     with pytest.raises(DesignInfeasible) as caught:
         second_order(0.5, 2e-3, 50.0, 0.8)
@@ -234,3 +225,26 @@ def test_a_table_of_one_link_reaches_to_the_speed_of_a_sagged_one() -> None:
     assert tops["speed", 2][-1] == pytest.approx(300.0)
     V, omega = 0.92 * SURFACE.inverter.voltage_utilisation * 210.0, 300.0 * math.pi / 30.0 * SURFACE.machine.pole_pairs
     assert tops["flux", 1][0] == pytest.approx(V / omega, rel=1e-6)
+
+
+def test_errors_between_voltages_are_over_what_is_asked() -> None:
+    """Of currents between those of two voltages: half of the torque that is asked is twice the excess."""
+    rated, volts = ratings(SURFACE, 0.92 * SURFACE.inverter.V_max_v), np.array([150.0, 230.0])
+    machine = at_temperature(SURFACE.machine, None)
+    V = 0.92 / math.sqrt(3.0) * volts
+    table = speed_table(
+        machine, torque_nm=np.linspace(-60.0, 60.0, 7), speed_rpm=[500.0, 700.0], V_max_v=V, I_max_apk=56.0,
+        i_d_min_a=rated.i_d_min_a, U_dc_v=volts,
+    )  # fmt: skip
+    excess = _voltage_excess(table, GridBounds(0.5, 1e9))
+    assert _voltage_excess(table, GridBounds(0.25, 1e9)) == pytest.approx([2.0 * excess[0]])
+    m, worst = SURFACE.machine, 0.0
+    omega = table.y * m.pole_pairs * math.pi / 30.0
+    for share in (0.25, 0.5, 0.75):
+        i_d, i_q = (a[..., 0] + share * (a[..., 1] - a[..., 0]) for a in (table.i_d_a, table.i_q_a))
+        made = 1.5 * m.pole_pairs * (m.psi_f_wb + (m.L_d_h - m.L_q_h) * i_d) * i_q
+        reach = torque_limits(machine, omega, [V[0] + share * (V[1] - V[0])], 56.0, rated.i_d_min_a)
+        wanted = np.clip(table.torque_nm[:, None], reach.least_nm[:, 0], reach.largest_nm[:, 0])
+        worst = max(worst, float(np.nanmax(np.abs(made - wanted))) / 0.5)
+    assert excess == pytest.approx([worst], rel=1e-9)
+    assert worst > 1e-3

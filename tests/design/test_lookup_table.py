@@ -91,7 +91,9 @@ def test_resistance_can_leave_braking_torque_only() -> None:
     assert bounds.largest_nm[0, 0] < 0.0
     centre_q, radius = -omega * N.psi_f * N.R / Z2, V / math.sqrt(Z2)
     assert bounds.largest_nm[0, 0] == pytest.approx(6.0 * N.psi_f * (centre_q + radius), rel=1e-9)
-    assert cell(N, 1.0, omega, V, 1000.0)[2] == pytest.approx(bounds.largest_nm[0, 0], rel=1e-12)
+    for torque in (1.0, 0.0):
+        assert cell(N, torque, omega, V, 1000.0)[2] == pytest.approx(bounds.largest_nm[0, 0], rel=1e-12)
+        assert cell(N, -torque, -omega, V, 1000.0)[2] == pytest.approx(-bounds.largest_nm[0, 0], rel=1e-12)
 
 
 def test_a_table_wholly_beyond_the_reachable_speed_says_none() -> None:
