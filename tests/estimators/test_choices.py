@@ -51,6 +51,8 @@ def test_a_swing_must_explain_half_of_what_a_rigid_shaft_leaves(monkeypatch: pyt
     assert _swing_of(monkeypatch, {10.0: 0.9}) == 0.0  # two swings of the longest: the slowest is friction
     assert _swing_of(monkeypatch, {11.0: 0.9}) > 10.3
     assert _swing_of(monkeypatch, {210.0: 0.9}) == 0.0  # a fifth of the rows' rate is 200
+    slow = _swing_of(monkeypatch, {16.0: 0.9})
+    assert _swing_of(monkeypatch, {16.0: 0.9}, 0.5 * slow) == slow  # twice a resonance is another
 
 
 def test_another_resonance_is_twice_the_claimed_one_and_that_explains_less_than_half_as_much(

@@ -209,6 +209,8 @@ def test_the_curve_at_an_edge_begins_where_the_capacitance_takes_half_of_the_pla
     first = 0.5 + 4.0 * 50e-6 / (4.0 * 3e-3)
     charge = (6.0 - 4.0) * first
     assert found.i_phase_a[-3:] == pytest.approx([first, 1.0 + 5.0 / 240.0, 5.0 + 6.0 / 240.0], rel=EXACT)
+    reached = edge_curve(InverterCurve(curve.i_phase_a, np.array([6.1, 6.1, 6.1]), 0.0), modulation)
+    assert reached.u_error_v[-4] == pytest.approx(6.0 - 6e-3 * reached.i_phase_a[-3] / reached.i_phase_a[-4], rel=EXACT)
     below = found.i_phase_a[:-3]
     assert below[0] == pytest.approx(2.0 * charge / 6.0, rel=EXACT) and len(below) == 11
     assert np.diff(np.log(np.append(below, first))) == pytest.approx(

@@ -199,6 +199,14 @@ def test_too_few_pairs_show_nothing() -> None:
     assert shown_instant(few, 0.4, 0.1, MODULATION, 1.0) is None
 
 
+def test_between_the_points_of_the_grid_the_prediction_is_bilinear() -> None:
+    table = np.random.default_rng(4).standard_normal((len(INSTANTS), len(LAGS))) * T_S
+    shown = ShownInstant(0.2 * T_S, 0.01 * T_S, T_S, 0.0, 1.0, table)
+    instant, lag = 0.3 * INSTANTS[4] + 0.7 * INSTANTS[5], 0.6 * LAGS[7] + 0.4 * LAGS[8]
+    expected = np.array([0.3, 0.7]) @ table[4:6, 7:9] @ np.array([0.6, 0.4])
+    assert shown.distance(1.0 - instant, lag * T_S) == pytest.approx((expected - 0.2 * T_S) / (0.01 * T_S), rel=1e-9)
+
+
 def test_just_beyond_the_grid_the_distance_goes_on() -> None:
     """A sample older than the grid knows: without a slope there L came out 50 % wide (encoder age 1 us of 34)."""
     table = np.tile(np.array(INSTANTS)[:, None] * T_S, (1, len(LAGS)))

@@ -274,6 +274,10 @@ def test_noise_of_the_input_is_taken_from_its_power() -> None:
     found = response_lines.without_noise(U, 1.2)
     assert found.shape == (2, end) and end < 120
     assert found == pytest.approx((U * np.maximum(share, 0.5))[:, :end], rel=EXACT)
+    flat = np.ones((2, 46)) + 0j
+    assert response_lines.without_noise(flat, 0.5) == pytest.approx(0.5 * flat)
+    with pytest.raises(IdentificationError, match="on 45 of 45 lines, 46 are needed"):
+        response_lines.without_noise(flat[:, 1:], 0.5)
     with pytest.raises(
         IdentificationError, match="E_COHERENCE: the torque is above .* on 0 of 120 lines, 46 are needed"
     ):

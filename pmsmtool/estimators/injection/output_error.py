@@ -105,7 +105,7 @@ def recursion(pole: float, drive: Array, start: float) -> Array:
     """
     n = len(drive)
     if pole <= FAST_POLE:
-        taps = 1 if pole <= 0.0 else min(n, 2 + int(math.log(1e-18) / math.log(max(pole, 1e-300))))
+        taps = min(n, 2 + int(math.log(1e-18) / math.log(max(pole, 1e-300))))
         powers = pole ** np.arange(taps, dtype=np.float64)
         out = np.empty(n + 1)
         out[0] = start
@@ -268,8 +268,7 @@ def _stepped(model: AxisModel, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
     """Current and sensor output a time after a voltage of 1 V began, shape (2, ...)."""
     out = np.empty((2, *t_s.shape))
     rate = model.R_ohm / model.L_h
-    slow = abs(rate) * float(np.max(t_s)) <= SMALLEST_RATE
-    out[0] = t_s / model.L_h if slow else -np.expm1(-rate * t_s) / model.R_ohm
+    out[0] = -np.expm1(-rate * t_s) / model.R_ohm if model.R_ohm else t_s / model.L_h
     if model.lag_s <= 0.0:
         out[1] = out[0]
         return out
