@@ -237,3 +237,25 @@ def test_a_row_that_is_met_is_left_alone(double: bool) -> None:
         c_rows(binding, [row])[0], binding.types["pmsm_dq"](1.5, -2.25), ctypes.byref(steps)
     )
     assert (point.d, point.q, steps.value) == (1.5, -2.25, 0)
+
+
+@pytest.mark.parametrize("double", [False, True])
+def test_of_equal_rows_the_first_binds_and_on_the_border_none(double: bool) -> None:
+    """3, 4, 5 and 1, 0 are exact in binary arithmetic."""
+    binding = core(double=double)
+    dq, real = binding.types["pmsm_dq"], binding.types["pmsm_real"]
+    circle = (np.eye(2), np.zeros(2), 5.0)
+    for r, expected in (((6.0, 8.0), (1, 0, (3.0, 4.0))), ((3.0, 4.0), (0, 255, (3.0, 4.0)))):
+        v, active, steps = dq(), ctypes.c_uint32(), ctypes.c_uint32()
+        status = binding.library.pmsm_project_rows(
+            c_rows(binding, [circle] * 3), 3, dq(*r), ctypes.byref(v), ctypes.byref(active), ctypes.byref(steps)
+        )
+        assert (status, active.value) == expected[:2]
+        assert (v.d, v.q) == pytest.approx(expected[2], rel=2e-6)
+    for x, shown in ((3.0, (1, 0, 1.0)), (1.0, (0, 255, 1.0))):
+        v, active, steps = dq(), ctypes.c_uint32(), ctypes.c_uint32()
+        planes = (dq * 3)(*([dq(1.0, 0.0)] * 3)), (real * 3)(1.0, 1.0, 1.0), 3
+        status = binding.library.pmsm_project_half_planes(
+            *planes, dq(x, 2.0), ctypes.byref(v), ctypes.byref(active), ctypes.byref(steps)
+        )
+        assert (status, active.value, v.d, v.q) == (*shown, 2.0)
