@@ -3,6 +3,7 @@
 
     python -m benchmarks.axis_loads --loads 40
     python -m benchmarks.axis_loads --loads 10 --drive epos4
+    python -m benchmarks.axis_loads --loads 6 --first 944 --drive copley --table TABLE.csv
 
 The reference drive's firmware turns a motor with a load: resonance 50 to 800 Hz, load over motor inertia 0.2 to 20,
 damping 0.5 to 5 %, Coulomb friction 0.5 to 3 % of the rated torque, half of the loads with backlash of up to 0.1
@@ -15,6 +16,10 @@ With ``--drive FAMILY`` a simulated drive of that family does the whole job over
 gives: `backup`, `tune --axis --stored`, `move`, `flash-params`, `move`. Stored are the gains of its face (crossover 60
 rad/s and 15 1/s for the whole inertia, no feed-forward). The move is of 60 degrees at half of the designed
 acceleration, at most 300 rad/s2. Said besides are how long both moves kept the drive, and why a load got no comparison.
+
+Families whose gains have no published unit are nodes of a ``--table`` (``sim/foreign/file_rows.py``) with gains that a
+seed drew for the motor alone (``sim/foreign/drawn_gains.py``). There `map learn` comes first, on the uncoupled motor;
+the other commands take the map that it wrote.
 """
 
 from __future__ import annotations
@@ -45,7 +50,7 @@ from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.closed_loop import image_of
 from pmsmtool.sim.foreign.behind import stored_gains
 from pmsmtool.sim.kernel import Simulation
-from pmsmtool.sim.simulated_machine import build_setup
+from pmsmtool.sim.simulated_machine import build_setup, settings_of
 
 STD = {"J_kgm2": 0.015, "resonance_hz": 0.005, "antiresonance_hz": 0.005}
 """Relative standard deviation of what the design knows."""
@@ -83,6 +88,15 @@ def loaded(seed: int) -> tuple[MachineFile, MachineFile]:
     return replace(described, simulation={**base.simulation, **settings}), described
 
 
+def uncoupled(truth: MachineFile) -> MachineFile:
+    """Return the motor alone, its inertia known to :data:`STD`."""
+    load = ("J_load_kgm2", "coupling_stiffness_nm_per_rad", "coupling_damping_nms_per_rad", "backlash_rad")
+    settings = {key: value for key, value in truth.simulation.items() if key not in load}
+    J = settings_of(truth).number("J_kgm2")
+    machine = replace(truth.machine, J_kgm2=J, resonance_hz=None, antiresonance_hz=None, resonance_zeta=None)
+    return replace(truth, machine=machine, std={"J_kgm2": STD["J_kgm2"] * J}, simulation=settings)
+
+
 def error_rad(truth: MachineFile, params: ParameterSet, design: Design) -> float:
     """Return the largest following error (rad) of the design's move with some parameters; infinity when it trips."""
     setup, keep = build_setup(truth)
@@ -101,17 +115,48 @@ def error_rad(truth: MachineFile, params: ParameterSet, design: Design) -> float
     return found if math.isfinite(found) else math.inf
 
 
+LEARNED = {
+    "copley": "copley", "nanotec-c5-e": "nanotec", "nanotec-pd4-c": "nanotec", "zeroerr": "zeroerr",
+    "faulhaber": "faulhaber",
+}  # fmt: skip
+"""Map of the families of a table whose gains `map learn` must find first."""
 SHARE_OF_ACCELERATION, FASTEST = 0.5, 300.0
 """Acceleration of the compared move: of the designed one, and its largest (rad/s2)."""
 
 
-def compared_on(family: str, seed: int) -> tuple[float, float, float, float, str]:
+def done(*arguments: str) -> Any:
+    """Run a command and return what it answers.
+
+    Raises
+    ------
+    RuntimeError
+        It ended with an error.
+    """
+    code, answer, reason = asked(*arguments, "--json")
+    if code not in (0, 10):
+        raise RuntimeError(f"{arguments[0]}: exit {code}: {reason}")
+    return answer
+
+
+def learned(family: str, channel: str) -> None:
+    """Learn the gains of the uncoupled motor's drive into ``mine.toml``, as a person does."""
+    drive = ("--map", LEARNED[family], "--sim", channel)
+    done("backup", "-o", "before.json", *drive)
+    answer = done("map", "learn", "--machine", "motor.toml", "-o", "mine.toml", "--shaft", "free", "--yes", *drive)
+    unknown = [f"{gain['name']}: {gain['why']}" for gain in answer["gains"] if gain["scale"] is None]
+    if unknown:
+        raise RuntimeError(f"map learn: not decided: {'; '.join(unknown)}")
+    if len(answer["gains"]) < len(GAINS):
+        raise RuntimeError(f"map learn: no object is known for one of {', '.join(GAINS)}")
+
+
+def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float, float, str]:
     """Return the ratio of following errors on a family's drive, margins (degree, dB), seconds of the moves, and a line.
 
     Raises
     ------
     RuntimeError
-        A command ended with another exit code than 0.
+        A command ended with an error, or a gain stayed unknown.
     """
     truth, known = loaded(seed)
     with tempfile.TemporaryDirectory() as folder:
@@ -119,16 +164,16 @@ def compared_on(family: str, seed: int) -> tuple[float, float, float, float, str
         os.environ["PMSMTOOL_HOME"] = folder
         Path("truth.toml").write_text(dump_machine_file(truth), encoding="utf-8")
         Path("known.toml").write_text(dump_machine_file(known), encoding="utf-8")
-        drive = ("--map", family, "--sim", f"truth.toml?drive={family}&nv=drive.nv&encoder_bits={ENCODER_BITS}")
-
-        def done(*arguments: str) -> Any:
-            code, answer, reason = asked(*arguments, "--json")
-            if code:
-                raise RuntimeError(f"{arguments[0]}: exit {code}: {reason}")
-            return answer
-
+        node = f"eds={table}#{family}&gains={seed}" if family in LEARNED else f"drive={family}"
+        node += f"&nv=drive.nv&encoder_bits={ENCODER_BITS}"
+        used = family
+        if family in LEARNED:
+            Path("motor.toml").write_text(dump_machine_file(uncoupled(truth)), encoding="utf-8")
+            learned(family, f"motor.toml?{node}")
+            used = "mine.toml"
+        drive = ("--map", used, "--sim", f"truth.toml?{node}")
         done("backup", "-o", "stored.json", *drive)
-        made = done("tune", "known.toml", "-o", "axis.toml", "--axis", "--stored", "stored.json", "--map", family)
+        made = done("tune", "known.toml", "-o", "axis.toml", "--axis", "--stored", "stored.json", "--map", used)
         acceleration = min(FASTEST, SHARE_OF_ACCELERATION * float(made["facts"]["axis_acceleration_rad_s2"]))
         move = ("move", "--by", "60deg", "--speed", "300rpm", "--acceleration", f"{acceleration:.4g}", *drive, "--yes")
         before = done(*move)
@@ -147,13 +192,13 @@ def compared_on(family: str, seed: int) -> tuple[float, float, float, float, str
     return ratio, phase, peak, seconds, line
 
 
-def compare_on(family: str, first: int, loads: int) -> None:
+def compare_on(family: str, first: int, loads: int, table: str) -> None:
     """Compare moves of random loads on a family's drive; print a line for every one, and the shares."""
     rows, ended = [], 0
     before = Path.cwd()
     for seed in range(first, first + loads):
         try:
-            *numbers, line = compared_on(family, seed)
+            *numbers, line = compared_on(family, seed, table)
         except RuntimeError as error:
             ended += 1
             line = str(error)
@@ -161,6 +206,9 @@ def compare_on(family: str, first: int, loads: int) -> None:
             rows.append(numbers)
         os.chdir(before)
         print(f"{seed}: {line}", flush=True)
+    if not rows:
+        print(f"none of {loads} compared")
+        return
     ratios, phases, peaks, seconds = np.array(rows).T
     print(f"following error over that of the stored gains: median {np.median(ratios):.2f}, p95 "
           f"{np.quantile(ratios, 0.95):.2f}, largest {ratios.max():.2f}; least margin {phases.min():.1f} deg, "
@@ -174,9 +222,10 @@ def main() -> None:
     parser.add_argument("--loads", type=int, default=40)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--drive", default="", help="family of the simulated drive; default: our own core")
+    parser.add_argument("--table", type=Path, default=Path(), help="objects of makers' files, for families to learn")
     options = parser.parse_args()
     if options.drive:
-        compare_on(options.drive, options.first, options.loads)
+        compare_on(options.drive, options.first, options.loads, str(options.table.resolve()))
         return
     plain, kept, phases, peaks, infeasible = [], [], [], [], 0
     for seed in range(options.first, options.first + options.loads):

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,7 +64,7 @@ def learn_command(
 
     The shaft must be free and without load. Scales rest on the inertia in the machine file and on its standard
     deviation in [std]; without one nothing that rests on the inertia is decided. Published scales of the map are
-    checked. Exit code 0: everything decided; 1: a published scale is contradicted; 6: nothing decided; 10: some.
+    checked. Exit code 0: all decided; 1: a published scale is contradicted; 5: a limit ended a move; 6: none; 10: some.
     """
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.drive.motion_objects import unlike_stated
@@ -73,7 +73,7 @@ def learn_command(
     from pmsmtool.flash.map_gate import check_motion
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, gain_address, gain_object, refuse_unsafe
-    from pmsmtool.measurement.learn_gains import learn_speed_loop, learning_envelope
+    from pmsmtool.measurement.learn_gains import learn_speed_loop, learning_envelope, within_budget
     from pmsmtool.measurement.learn_position_gain import POSITION, learn_position_gain, position_gain
     from pmsmtool.measurement.learned_rows import emf_of, learned_gains
 
@@ -98,6 +98,7 @@ def learn_command(
         envelope = learning_envelope(
             drive, file, motion.i_max_apk, motion.speed_max_rad_s, motion.shaft, motion.load, motion.brake
         )
+        first_apk = within_budget(drive, machine, envelope.i_max_apk, envelope.speed_max_rad_s)
         refuse_unsafe(node, envelope)
         lines = [
             *envelope.lines(),
@@ -109,14 +110,19 @@ def learn_command(
             "nothing is stored in the drive; every changed object is restored",
         ]  # fmt: skip
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
-        measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, emf_of(file), out.note)
-        results = learned_gains(file, measured)
+        measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, first_apk, emf_of(file), out.note)
+        results, stopped = learned_gains(file, measured), None
         if POSITION in found:
-            results[POSITION] = learn_position_gain(connection, node, found[POSITION], envelope, out.note)
+            slow = replace(envelope, i_max_apk=first_apk)
+            results[POSITION], stopped = learn_position_gain(connection, node, found[POSITION], slow, out.note)
         drive.close()
     for note in measured.notes:
         out.warn(note)
-    _tell(file, drive, measured, found, {name: results[name] for name in asked if name in results}, output, out)
+    try:
+        _tell(file, drive, measured, found, {name: results[name] for name in asked if name in results}, output, out)
+    finally:
+        if stopped is not None:
+            raise stopped
 
 
 def _addresses(names: tuple[str, ...]) -> dict[str, tuple[int, int] | None]:

@@ -14,7 +14,7 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.position_drive import PositionDrive
-from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal
+from pmsmtool.errors import IdentificationError, LimitExceeded, NotAvailable, SafetyRefusal
 from pmsmtool.experiments.move import record_move
 from pmsmtool.identification.learned_gains import Learned
 from pmsmtool.identification.position_lag import PositionLag, position_lag, position_scale
@@ -53,10 +53,11 @@ def _place(node: DriveNode, name: str) -> tuple[int, int] | None:
 
 def learn_position_gain(
     connection: Connection, node: DriveNode, gain: GainObject, envelope: Envelope, say: Callable[[str], None]
-) -> Learned:
+) -> tuple[Learned, LimitExceeded | None]:
     """Return what one count of the position gain is worth, or why that stays unknown; the drive is as before.
 
-    What was learned of other gains stays, also where a limit of the motion stopped the shaft: that is the reason then.
+    What was learned of other gains stays where this is refused: that is the reason then. A limit of the motion that
+    stopped the shaft is returned beside it, for the caller to raise.
 
     Raises
     ------
@@ -66,12 +67,13 @@ def learn_position_gain(
     try:
         drive = PositionDrive(connection, node.node, drive_map=node.map)
         try:
-            return _moved(drive, gain, envelope, say)
+            return _moved(drive, gain, envelope, say), None
         finally:
             drive.close()
     except (IdentificationError, NotAvailable, SafetyRefusal) as error:
         likely = f" (likely: {error.likely})" if error.likely else ""
-        return Learned(POSITION, None, math.inf, None, "", error.what.partition("\n")[0] + likely)
+        unknown = Learned(POSITION, None, math.inf, None, "", error.what.partition("\n")[0] + likely)
+        return unknown, error if isinstance(error, LimitExceeded) else None
 
 
 def _moved(drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Callable[[str], None]) -> Learned:
