@@ -23,6 +23,7 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap
+from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import TORQUE_PER_AMPERE
 from pmsmtool.params.parameter_set import ParameterSet
@@ -76,9 +77,20 @@ def design_axis(
         fitting |= _slowed(drive_map, group, wanted)
     less = _cut(drive_map, wanted)
     slower = [name for name, value in fitting.items() if value < wanted.values[name]]
+    faster = [name for name, value in fitting.items() if value > wanted.values[name]]
     held = drive_map.quantised(replace(wanted, values=fitting | less)).values
     design = made.with_held({name: value for name, value in held.items() if drive_map.writes(name, wanted.values)})
+    if (
+        faster
+        and min(float(design.facts[f"axis_{loop}_phase_least_deg"]) for loop in ("speed", "position")) < LEAST_DEG
+    ):
+        raise DesignInfeasible(
+            f"{', '.join(faster)}: the drive's objects hold no gain so small",
+            likely="a heavy load, and an object whose longest integral time is short",
+            hint="make the unit of that time longer in the drive, where it has one",
+        )  # fmt: skip
     notes += tuple(f"{name}: {wanted.values[name]:.4g} is designed, slower by what its objects hold" for name in slower)
+    notes += tuple(f"{name}: {wanted.values[name]:.4g} is designed, its object holds no less" for name in faster)
     notes += tuple(f"{name}: {wanted.values[name]:.4g} is designed, its object holds no more" for name in less)
     if CASCADE[2] in less:  # the errors were predicted with all of it
         kept = {name: fact for name, fact in design.facts.items() if name not in PREDICTED}
@@ -88,6 +100,8 @@ def design_axis(
 
 GROUPS = ({SPEED[0]: 1, SPEED[1]: 2}, {PID[0]: 2, PID[1]: 3, PID[2]: 1})
 """Gains of one controller, and the power of its crossover with which each grows."""
+LEAST_DEG = 35.0
+"""Least phase margin over the tolerance box with an integral time shorter than designed."""
 SIGNED = ("INTEGER8", "INTEGER16", "INTEGER32")
 
 
@@ -112,7 +126,10 @@ def _cut(drive_map: DriveMap, wanted: ParameterSet) -> dict[str, float]:
 
 
 def _slowed(drive_map: DriveMap, group: dict[str, int], wanted: ParameterSet) -> dict[str, float]:
-    """Return the gains of a controller, all of it slower where one of them is beyond what its object can hold."""
+    """Return the gains of a controller, all of it slower where one of them is beyond what its object can hold.
+
+    An integral time grows when the loop becomes slower: where it is too long, it is the longest that its object holds.
+    """
     rows = [
         (drive_map.cells[name], power)
         for name, power in group.items()
@@ -121,8 +138,13 @@ def _slowed(drive_map: DriveMap, group: dict[str, int], wanted: ParameterSet) ->
     share = 1.0
     for cell, power in rows:
         counts = cell.counts(wanted.values[cell.name], wanted.values)
-        share = min(share, (_largest(cell) / counts) ** (1.0 / power) if counts else 1.0)
-    return {cell.name: wanted.values[cell.name] * share**power for cell, power in rows}
+        grows = power - group.get(cell.gain, 0)
+        share = min(share, (_largest(cell) / counts) ** (1.0 / grows) if counts and cell.form != "time" else 1.0)
+    slowed = {cell.name: wanted.values[cell.name] * share**power for cell, power in rows}
+    for cell, _ in rows:
+        if cell.form == "time":
+            slowed[cell.name] *= max(1.0, cell.counts(slowed[cell.name], {**wanted.values, **slowed}) / _largest(cell))
+    return slowed
 
 
 def not_offered(drive_map: DriveMap) -> dict[str, str]:

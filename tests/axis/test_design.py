@@ -14,12 +14,21 @@ from pmsmtool.axis.design import PID, AxisGains, AxisRequest, axis_path, from_pi
 from pmsmtool.axis.loops import lifted
 from pmsmtool.axis.robustness import axis_margins
 from pmsmtool.axis.search import Box, Limits, stiffest
-from pmsmtool.commissioning.axis_design import axis_drive, axis_parameters, design_axis, not_offered, own_torque
+from pmsmtool.commissioning.axis_design import (
+    GROUPS,
+    _slowed,
+    axis_drive,
+    axis_parameters,
+    design_axis,
+    not_offered,
+    own_torque,
+)
 from pmsmtool.design.design_file import Design, design_text, parse_design
 from pmsmtool.design.loops.speed_loop import Notch
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.envelope import largest_torque
+from pmsmtool.drive_maps.measured_rows import MeasuredRow, with_measured
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.flash.journal import Entry
@@ -77,6 +86,20 @@ def test_the_stiffest_gains_touch_a_limit() -> None:
     worst = min(float(facts[f"axis_{loop}_phase_least_deg"]) for loop in ("speed", "position"))
     peak = max(float(facts[f"axis_{loop}_S_peak_db"]) for loop in ("speed", "position"))
     assert 45.0 <= worst < 45.5 or 5.7 < peak <= 6.0
+
+
+@pytest.mark.parametrize(("K_i", "expected"), [(2.0, 2.0), (0.5, 1.0 / 0.65535)])
+def test_an_integral_time_beyond_its_object_is_the_longest_it_holds(K_i: float, expected: float) -> None:
+    """A slower loop needs a longer time: `tune` ended with "the drive cannot hold 1 value"."""
+    rows = [
+        MeasuredRow("speed.K_p_nms_per_rad", 0x60F9, 1, "UNSIGNED16", "value", "", 1e-4, "N m s/rad", 0.1),
+        MeasuredRow("speed.K_i_nm_per_rad", 0x60F9, 2, "UNSIGNED16", "time", "speed.K_p_nms_per_rad", 1e-5, "s", 0.1),
+    ]
+    made = with_measured(load_family("cia402"), 0x999, 1, rows, "on a bench", None)
+    wanted = ParameterSet({"speed.K_p_nms_per_rad": 1.0, "speed.K_i_nm_per_rad": K_i})
+    found = _slowed(made, GROUPS[0], wanted)
+    assert found == pytest.approx({"speed.K_p_nms_per_rad": 1.0, "speed.K_i_nm_per_rad": expected})
+    made.encode(replace(wanted, values=found))
 
 
 def test_a_gain_beyond_its_object_is_cut_and_judged_so() -> None:
