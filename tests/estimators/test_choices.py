@@ -169,6 +169,12 @@ def test_an_error_of_the_encoder_is_large_and_alike_in_both_directions(
     assert found[1] == pytest.approx(0.3 * size if 0.3 * size > PER_TURN_LEAST_RAD else 0.0, rel=1e-6, abs=1e-12)
 
 
+def test_one_pole_pair_has_orders_to_compare_with_too() -> None:
+    theta = np.arange(0.0, 2.0 * math.pi, 2.0 * math.pi / 720.0)
+    run = _trace(theta, theta_M_rad=theta, theta_imposed_rad=theta - 0.01 * np.cos(theta))
+    assert _per_turn(run, run, 1) == pytest.approx((0.01, 0.0), abs=1e-9)
+
+
 @pytest.mark.chain
 @pytest.mark.parametrize("amplitude", [0.3, 0.005, 0.001])
 def test_a_torque_over_the_angle_that_one_mass_leaves_is_taken_along(amplitude: float) -> None:

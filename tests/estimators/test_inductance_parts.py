@@ -384,3 +384,7 @@ def test_an_instant_that_contradicts_the_square_waves_is_in_the_interval(monkeyp
     straight = _estimated(monkeypatch, lossy)
     assert found.sampling is None and found.L_q.value == pytest.approx(straight.L_q.value, rel=EXACT)
     assert found.L_q.std == pytest.approx(math.hypot(straight.L_q.std, 0.02 * L_Q), rel=1e-6)
+    # a fit that does not follow, or a delay beyond the grid, says nothing of iron loss
+    for part, counts in (({"chi2": 3.0}, True), ({"chi2": 3.1}, False), ({"delay": 0.5}, False)):
+        lost = _estimated(monkeypatch, {**far, "q": replace(far["q"], **part)}, lossy, SHOWN).L_q.std
+        assert lost == pytest.approx(math.hypot(straight.L_q.std, 0.02 * L_Q * counts), rel=1e-6)

@@ -429,3 +429,15 @@ def test_what_cannot_be_told_apart_is_named_with_its_partner() -> None:
     with pytest.raises(IdentificationError, match="R_s_ohm shows in nothing: no current flows"):
         tracking._refuse_entangled(_track(std_R=0.06), steady * (np.arange(10) != 1), KNOWN, (0.01, 0.01), wanted)
     tracking._refuse_entangled(_track(std_R=0.06), steady, KNOWN, (0.01, 0.01), ("psi_f_wb",))
+
+
+def test_the_walk_of_a_value_grows_with_the_time_since_the_last_observation() -> None:
+    """Observations that say nothing: the variances are those of the start and five times the walk, of 0.5 s."""
+    tracker = tracking.Tracker(KNOWN, (1e6, 1e6), 5.0)
+    for t in (100.0, 100.5):
+        tracker.update(t, np.array([1.0, 2.0, 100.0, *np.zeros(7)]), np.zeros(2))
+    value, std = tracker.state()
+    assert value[:2] == pytest.approx([0.5, 0.1], rel=1e-6)
+    expected = np.sqrt(np.array([0.3, 0.1]) ** 2 + 0.5 * (5.0 * np.array([2e-3, 3e-4])) ** 2) * np.array([0.5, 0.1])
+    assert std[:2] == pytest.approx(expected, rel=1e-8)  # the walk is 3e-4 and 6e-5 of it
+    assert std[3:5] == pytest.approx([0.02 * 2e-3, 0.02 * 3e-3], rel=1e-6)
