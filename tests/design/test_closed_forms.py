@@ -167,7 +167,9 @@ def test_overmodulation_costs_the_current_of_its_harmonics() -> None:
 
 def test_an_interval_that_nobody_gave_says_why() -> None:
     box = tolerance_box(SURFACE)
-    assert "R_s_ohm: no standard deviation is given" in " ".join(box.notes)
+    said = "; ".join(box.notes)
+    assert "R_s_ohm: no standard deviation is given, 3 % assumed" in said
+    assert "1 degree assumed" in said and "DC-link voltage: +-5 % assumed" in said
 
 
 def test_a_band_is_made_of_runs_that_are_left_out_one_by_one() -> None:
