@@ -177,7 +177,7 @@ def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float
         acceleration = min(FASTEST, SHARE_OF_ACCELERATION * float(made["facts"]["axis_acceleration_rad_s2"]))
         speed = "300rpm"
         if family in LEARNED:  # the stored gains are for the motor alone
-            speed, acceleration = "100rpm", min(acceleration, CALM)
+            speed, acceleration = "40rpm", min(acceleration, CALM)
         move = ("move", "--by", "60deg", "--speed", speed, "--acceleration", f"{acceleration:.4g}", *drive, "--yes")
         before = done(*move)
         done("flash-params", "axis.toml", *drive, "--yes")
