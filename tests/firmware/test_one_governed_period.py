@@ -17,6 +17,7 @@ from tests.firmware.closed_loop import (
     FLAG_ACTIVE,
     FLAG_FALLBACK,
     HEXAGON,
+    LINE,
     LINEARISED,
     MINIMUM_TIME,
     MODE_CURRENT,
@@ -298,10 +299,13 @@ def test_a_request_passes_where_all_rows_of_the_paper_admit_it() -> None:
     assert {-1, 0, 1, k_max + 1} <= set(seen)
 
 
-def test_without_a_current_row_the_reachable_request_knows_none() -> None:
+@pytest.mark.parametrize("mode", [BEST, LINE])
+def test_without_a_current_row_the_reachable_request_knows_none(mode: int) -> None:
     """A voltage limit below the current, in numbers: 23 V, 40 A."""
-    loop = governed(BEST, governor__options=PRE_PROJECTION, governor__observer_gain=0.0)
+    loop = governed(mode, governor__options=PRE_PROJECTION, governor__observer_gain=0.0)
+    put(loop.state.reference_held, np.array([0.0, 40.0]))
     loop.measurement.U_dc, loop.plant.omega, loop.plant.i = 40.0, 5.0, np.array([0.0, 40.0])
     put(loop.state.integrator, np.array([0.0, 0.0]))
     live = loop.step(mode=MODE_CURRENT, i_d_ref=0.0, i_q_ref=40.0)
     close([live.i_d_ref, live.i_q_ref, live.binding], [0.0, 40.0, NONE])
+    assert (loop.state.reachable_age, loop.state.cornered) == (0, 0)
