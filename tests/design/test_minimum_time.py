@@ -8,12 +8,14 @@ import math
 import numpy as np
 import pytest
 
-from pmsmtool.design.minimum_time import TransferProblem, flux_time, minimum_time
+from pmsmtool.design.minimum_time import Flow, TransferProblem, flux_time, minimum_time
 from pmsmtool.errors import DesignInfeasible
 from tests.design.shooting import shoot
 
 AGREEMENT = 1e-8
 """Support function against shooting, relative (measured 1e-12 to 3e-11)."""
+FLOW = 1e-12
+"""Closed form against the matrix exponential (measured 6e-16)."""
 
 
 def problem(rpm: float, U_dc: float = 210.0) -> TransferProblem:
@@ -117,3 +119,31 @@ def test_out_of_reach_is_said_and_nothing_takes_no_time() -> None:
         minimum_time(weak, (0.0, 0.0), (5.1, 0.0))
     assert minimum_time(problem(310.0), (1.0, 2.0), (1.0, 2.0)) == 0.0
     assert minimum_time(problem(310.0), (1.0, 2.0), (1.1, 2.0), radius=0.2) == 0.0
+
+
+@pytest.mark.parametrize(
+    "F",
+    [
+        [[-60.0, 250.0], [-240.0, -65.0]],
+        [[0.0, 0.0], [0.0, 0.0]],
+        [[-90.0, 0.0], [0.0, 0.0]],
+        [[-90.0, 40.0], [0.0, 0.0]],
+    ],
+    ids=["turning", "nothing", "one axis", "singular and coupled"],
+)
+def test_the_flow_is_the_matrix_exponential_and_its_integral(F: list[list[float]]) -> None:
+    """e^[[F, 1], [0, 0]]T holds both: e^(F T) above left, its integral above right."""
+    linalg = pytest.importorskip("scipy.linalg")
+    flow, T = Flow(np.array(F)), 7e-3
+    joint = np.zeros((4, 4))
+    joint[:2, :2], joint[:2, 2:] = F, np.eye(2)
+    exact = linalg.expm(T * joint)
+    assert flow.at(np.array([T]))[0] == pytest.approx(exact[:2, :2], rel=FLOW, abs=FLOW)
+    assert flow.integral(T) == pytest.approx(exact[:2, 2:], rel=FLOW, abs=FLOW * T)
+
+
+def test_without_resistance_and_speed_the_voltage_pulls_the_flux_straight() -> None:
+    """V T = |L (end - start)|."""
+    machine = TransferProblem(0.0, 1e-3, 2.5e-3, 0.1, 0.0, 100.0)
+    expected = math.hypot(1e-3 * 40.0, 2.5e-3 * 50.0) / 100.0
+    assert minimum_time(machine, (-20.0, 10.0), (-60.0, -40.0)) == pytest.approx(expected, rel=AGREEMENT)

@@ -21,6 +21,7 @@ from pmsmtool.design.loops.speed_loop import (
     SpeedGains,
     SpeedMethod,
     SpeedPath,
+    companion,
     notch_coefficients,
     pole_placement,
     position_gain,
@@ -133,6 +134,24 @@ def test_pole_placement_on_the_stiff_machine() -> None:
     assert np.abs(poles) == pytest.approx(60.0)
     with pytest.raises(DesignInfeasible, match="friction"):
         pole_placement(1e-4, 1.0, 10.0, 1.0)
+
+
+def test_friction_beyond_the_damping_is_refused_with_the_frequency_that_works() -> None:
+    with pytest.raises(DesignInfeasible) as refused:
+        pole_placement(0.05, 2.0, 10.0, 0.8)
+    assert refused.value.hint == "ask for w_n above 25 rad/s"  # 2 / (2 * 0.8 * 0.05)
+    assert pole_placement(0.05, 2.0, 25.01, 0.8).K_p == pytest.approx(2.0 * 0.8 * 0.01 * 0.05)
+
+
+def test_a_loop_that_answers_in_one_sample_has_the_bandwidth_of_its_sampling() -> None:
+    """L = 1/(z - 1) closes to 1/z: of modulus one up to pi/T."""
+    assert margins(SampledLoop((1.0,), (1.0, -1.0), 1e-4)).bandwidth_rad_s == pytest.approx(math.pi / 1e-4)
+
+
+def test_a_realisation_has_its_transfer_function_whatever_the_leading_coefficient() -> None:
+    num, den, z = np.array([3.0, 1.0]), np.array([4.0, -2.0, 0.5]), np.exp(0.7j)
+    A, b, c, d = companion(num, den)
+    assert c @ np.linalg.solve(z * np.eye(2) - A, b) + d == pytest.approx(np.polyval(num, z) / np.polyval(den, z))
 
 
 def test_a_slow_position_loop_crosses_at_its_gain() -> None:

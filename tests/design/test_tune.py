@@ -32,6 +32,9 @@ from pmsmtool.params.parameter_set import parse_parameter_set
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 
+T_S_ROUNDED = 1e-5
+"""A gain from the period of the set, whole nanoseconds, against one from 1/12 kHz, relative (measured 1.3e-6)."""
+
 SURFACE = MachineFile(
     "surface",
     MachineParameters(4, 0.137, 2.3e-3, 2.1e-3, 0.41, I_nom_apk=28.0, I_max_apk=56.0, n_nom_rpm=620.0, J_kgm2=0.05),
@@ -236,6 +239,42 @@ def test_a_bad_request_lists_everything() -> None:
     with pytest.raises(ConfigError) as caught:
         TuneRequest(method="magic", damping=-1.0, voltage_margin=0.9, phase_margin_deg=95.0)
     assert len(caught.value.violations) == 4
+
+
+@pytest.mark.parametrize("periods", [0, 1001])
+def test_a_speed_controller_runs_every_period_to_every_thousandth(periods: int) -> None:
+    with pytest.raises(ConfigError) as refused:
+        TuneRequest(speed_decimation=periods)
+    assert refused.value.violations == (f"speed_decimation = {periods} is outside 1..1000",)
+    assert [TuneRequest(speed_decimation=allowed).speed_decimation for allowed in (1, 1000)] == [1, 1000]
+
+
+def small_times_s(design: Design) -> float:
+    """Current loop, its delay, estimate with two equal poles, filter, and half a period of the speed controller."""
+    pll, cut_off = design["encoder.pll_bandwidth_rad_s"], math.tau * design["speed.filter_hz"]
+    T_s = design["inverter.T_s_ns"] * 1e-9
+    return 1.0 / 4000.0 + 1.5 * T_s + 2.0 / pll + 1.0 / cut_off + 0.5 * design["speed.decimation"] * T_s
+
+
+def test_a_speed_bandwidth_asked_for_is_the_crossover_of_the_symmetric_optimum() -> None:
+    """K_p = J w and K_i = K_p w^2 T: |K_p / (J s)| is 1 at w, which is the mean of 1/T and K_i/K_p."""
+    design = tune(SURFACE, TuneRequest(speed_bandwidth_hz=12.0))
+    omega = math.tau * 12.0
+    assert design["speed.K_p_nms_per_rad"] == pytest.approx(0.05 * omega, rel=1e-9)
+    expected = 0.05 * omega**3 * small_times_s(design)
+    assert design["speed.K_i_nm_per_rad"] == pytest.approx(expected, rel=T_S_ROUNDED)
+
+
+@pytest.mark.parametrize("asked_hz", [None, 5.0])
+def test_placed_poles_of_the_speed_loop(asked_hz: float | None) -> None:
+    """K_p = 2 zeta w J - B, K_i = w^2 J; nothing asked: half the crossover of the symmetric optimum at 50 degree."""
+    stiff = replace(SURFACE, machine=replace(SURFACE.machine, B_nms=0.3))
+    request = TuneRequest(speed_bandwidth_hz=asked_hz, speed_method="pole-placement", speed_phase_margin_deg=50.0)
+    design = tune(stiff, replace(request, speed_damping=0.9))
+    a = math.tan(math.radians(90.0 + 50.0) / 2.0)
+    omega = math.tau * asked_hz if asked_hz else 0.5 / (a * small_times_s(design))
+    assert design["speed.K_p_nms_per_rad"] == pytest.approx(2.0 * 0.9 * omega * 0.05 - 0.3, rel=T_S_ROUNDED)
+    assert design["speed.K_i_nm_per_rad"] == pytest.approx(omega**2 * 0.05, rel=T_S_ROUNDED)
 
 
 def test_text_is_no_bandwidth() -> None:
