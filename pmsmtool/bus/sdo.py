@@ -82,8 +82,6 @@ class SdoChannel:
         Time-outs (s) of objects that need longer than ``timeout_s``.
     block_supported : bool or None
         None until a block transfer was tried.
-    block_size : int
-        Segments per sub-block of the next upload; fewer on a slow bus.
     retries, discarded : int
         Sums over the life of the channel.
     active_s : float
@@ -103,7 +101,6 @@ class SdoChannel:
         self.timeout_s = timeout_s
         self.slow_objects: dict[tuple[int, int], float] = {}
         self.block_supported: bool | None = None
-        self.block_size = sdo_block.FIRST_BLOCK
         self.retries = 0
         self.discarded = 0
         self._answers = GivenAnswers()

@@ -23,10 +23,7 @@ if TYPE_CHECKING:
     from pmsmtool.bus.sdo import SdoChannel
 
 BLOCK_SIZE = 127
-"""Most segments per sub-block, by the protocol."""
-SUB_BLOCK_S, LEAST_BLOCK, FIRST_BLOCK = 0.1, 8, 64
-"""How long a sub-block may hold the wire, its fewest segments, and those of the first one, whose time is not known: the
-tool's heartbeat (every 50 ms, expected within 250 ms) has a higher identifier than they, and waits for its end."""
+"""Segments per sub-block we ask for; the most the protocol has."""
 SWITCH_BYTES = 4
 """Protocol switch threshold: objects of up to this many bytes come expedited (pst, B9)."""
 SILENCES = 4
@@ -43,14 +40,13 @@ def upload(channel: SdoChannel, attempt: Attempt) -> tuple[bytes, bytes | None]:
     data, normal
         ``normal`` is None, or the frame with which the node began a normal upload instead.
     """
-    size = channel.block_size
-    channel.send(attempt.head(0xA4) + bytes((size, SWITCH_BYTES, 0, 0)))
+    channel.send(attempt.head(0xA4) + bytes((BLOCK_SIZE, SWITCH_BYTES, 0, 0)))
     first = _initiate(channel, attempt, lambda f: f[0] & 0xE0 == 0x40 or f[0] & 0xF9 == 0xC0)
     if first[0] & 0xE0 == 0x40:
         return b"", first
     announced = int.from_bytes(first[4:8], "little") if first[0] & 0x02 else None
     channel.check_announced(attempt, announced)
-    data, acknowledgement = _receive_blocks(channel, attempt, announced, size)
+    data, acknowledgement = _receive_blocks(channel, attempt, announced)
     end = _await_end(channel, attempt, acknowledgement)
     body = bytes(data[: len(data) - (end[0] >> 2 & 7)])
     channel.check_size(attempt, body, announced)
@@ -60,35 +56,32 @@ def upload(channel: SdoChannel, attempt: Attempt) -> tuple[bytes, bytes | None]:
     return body, None
 
 
-def _receive_blocks(channel: SdoChannel, attempt: Attempt, announced: int | None, size: int) -> tuple[bytearray, bytes]:
+def _receive_blocks(channel: SdoChannel, attempt: Attempt, announced: int | None) -> tuple[bytearray, bytes]:
     """Return the data with its padding, and the acknowledgement of its last sub-block."""
     limit = (attempt.limit if announced is None else announced) + 7
     data = bytearray()
     silences = 0
-    request, last = b"\xa3" + bytes(7), False
+    request = b"\xa3" + bytes(7)
+    channel.send(request)
     while True:
-        began_s = channel.connection.clock.now()
-        channel.send(request)
-        if last:
-            return data, request
-        count, last, frames = _receive_sub_block(channel, attempt, data, size)
-        if count >= LEAST_BLOCK:
-            took_s = max(channel.connection.clock.now() - began_s, SUB_BLOCK_S / BLOCK_SIZE)
-            channel.block_size = min(BLOCK_SIZE, max(LEAST_BLOCK, int(count * SUB_BLOCK_S / took_s)))
+        count, last, frames = _receive_sub_block(channel, attempt, data)
         silences = 0 if count else silences + 1
         if len(data) > limit:
             raise TransferLost(f"node sent more than {limit - 7} bytes", AbortCode.TOO_LONG)
         channel.raise_if_over(attempt, len(data) - 7)  # the last segment is padded
         if frames:
-            request = bytes((0xA2, count, size, 0, 0, 0, 0, 0))
+            request = bytes((0xA2, count, BLOCK_SIZE, 0, 0, 0, 0, 0))
         elif announced is not None and announced - len(data) <= 7:
             silences = SILENCES + 1
         # Else, of a lost request and two or more lost segments, the request is the likelier: it goes again.
         if silences > SILENCES:
             raise TransferLost(f"no segment after byte {len(data)}")
+        channel.send(request)
+        if last:
+            return data, request
 
 
-def _receive_sub_block(channel: SdoChannel, attempt: Attempt, data: bytearray, size: int) -> tuple[int, bool, int]:
+def _receive_sub_block(channel: SdoChannel, attempt: Attempt, data: bytearray) -> tuple[int, bool, int]:
     """Append one sub-block; return segments taken in order, whether the last was one, frames seen."""
     taken, frames, previous = 0, 0, b""
     for _ in range(FRAMES_LIMIT):
@@ -112,7 +105,7 @@ def _receive_sub_block(channel: SdoChannel, attempt: Attempt, data: bytearray, s
             attempt.retransmitted += 1  # behind a gap: comes again
         frames += 1
         previous = frame
-        if number == size or command & 0x80:
+        if number == BLOCK_SIZE or command & 0x80:
             return taken, False, frames
     raise TransferLost(f"node sends the same segments again and again after byte {len(data)}", AbortCode.SEQUENCE)
 

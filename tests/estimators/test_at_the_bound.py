@@ -84,7 +84,7 @@ def test_a_resistance_follows_its_copper() -> None:
     R = Estimate(2.0, 0.01, 0.0, "ohm", T_c=30.0)
     assert resistance_warmed(R, 80.0, Copper(20.0, alpha)) == pytest.approx(2.0 * 315.0 / 265.0, rel=ROUNDING)
     shared = resistance_warmed(R, 80.0, Copper(20.0, alpha, R_winding_ohm=1.5))
-    assert shared == pytest.approx(0.5 + 1.5 * 315.0 / 265.0, rel=ROUNDING)
+    assert shared == pytest.approx(2.0 + 1.5 * alpha * 50.0, rel=ROUNDING)  # stated at 20 degC
     assert resistance_warmed(R, math.nan, Copper(20.0, alpha)) == 2.0
 
 
