@@ -171,10 +171,8 @@ def _learn(
     drive = SpeedLoopDrive(connection, 1, drive_map=drive_map)
     gain, integral = gain_object(drive.node, GAIN, *gains.gain), gain_object(drive.node, INTEGRAL, *gains.integral)
     speed_max = SPEED_SHARE * rad_s_from_rpm(told.machine.n_max_rpm or 1000.0)
-    first_apk = within_budget(drive, told.machine, drive.rated_apk, speed_max)
-    envelope = Envelope(
-        within_budget(drive, told.machine, drive.rated_apk, speed_max, watched=True), speed_max, duration_s=120.0
-    )
+    i_max = within_budget(drive, told.machine, drive.rated_apk, speed_max)
+    envelope = Envelope(i_max, speed_max, duration_s=120.0)
     drive_live = drive.live
     largest = 0.0
 
@@ -199,16 +197,16 @@ def _learn(
     if kill_at:
         GuardedDrive.change = cut  # type: ignore[method-assign]
     try:
-        measured = learn_speed_loop(drive, gain, integral, envelope, first_apk, emf_of(told), lambda text: None)
+        measured = learn_speed_loop(drive, gain, integral, envelope, emf_of(told), lambda text: None)
     finally:
         GuardedDrive.change = change  # type: ignore[method-assign]
         result.over_speed = largest > OVER * speed_max
     for note in measured.notes:
         result.why["note"] = note
     _judge(result, told, machine, gains, measured, drive)
-    held, slow = position_gain(drive.node), replace(envelope, i_max_apk=first_apk)
+    held = position_gain(drive.node)
     if held is not None and gains.position == (held.item.index, held.item.sub):
-        one, _ = learn_position_gain(connection, drive.node, held, slow, lambda text: None)
+        one, _ = learn_position_gain(connection, drive.node, held, envelope, lambda text: None)
         _note(result, "K_v", one, "value", gains.K_v_per_s)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
     from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
+    from pmsmtool.errors import LimitExceeded
     from pmsmtool.identification.learned_gains import Learned
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.measurement.changed_gains import GainObject
@@ -73,7 +74,7 @@ def learn_command(
     from pmsmtool.flash.map_gate import check_motion
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, gain_address, gain_object, refuse_unsafe
-    from pmsmtool.measurement.learn_gains import learn_speed_loop, learning_envelope, within_budget
+    from pmsmtool.measurement.learn_gains import learn_speed_loop, learning_envelope
     from pmsmtool.measurement.learn_position_gain import POSITION, learn_position_gain, position_gain
     from pmsmtool.measurement.learned_rows import emf_of, learned_gains
 
@@ -98,7 +99,6 @@ def learn_command(
         envelope = learning_envelope(
             drive, file, motion.i_max_apk, motion.speed_max_rad_s, motion.shaft, motion.load, motion.brake
         )
-        first_apk = within_budget(drive, machine, envelope.i_max_apk, envelope.speed_max_rad_s)
         refuse_unsafe(node, envelope)
         lines = [
             *envelope.lines(),
@@ -110,19 +110,15 @@ def learn_command(
             "nothing is stored in the drive; every changed object is restored",
         ]  # fmt: skip
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
-        measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, first_apk, emf_of(file), out.note)
+        measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, emf_of(file), out.note)
         results, stopped = learned_gains(file, measured), None
         if POSITION in found:
-            slow = replace(envelope, i_max_apk=first_apk)
-            results[POSITION], stopped = learn_position_gain(connection, node, found[POSITION], slow, out.note)
+            results[POSITION], stopped = learn_position_gain(connection, node, found[POSITION], envelope, out.note)
         drive.close()
     for note in measured.notes:
         out.warn(note)
-    try:
-        _tell(file, drive, measured, found, {name: results[name] for name in asked if name in results}, output, out)
-    finally:
-        if stopped is not None:
-            raise stopped
+    told = {name: results[name] for name in asked if name in results}
+    _tell(file, drive, measured, found, told, output, out, stopped)
 
 
 def _addresses(names: tuple[str, ...]) -> dict[str, tuple[int, int] | None]:
@@ -153,8 +149,9 @@ def _tell(
     results: Mapping[str, Learned],
     output: Path | None,
     out: Output,
+    stopped: LimitExceeded | None,
 ) -> None:
-    """Print what was learned, write the map, and end with the exit code it deserves."""
+    """Print what was learned, write the map, and end as it deserves: first of all with a limit that stopped a move."""
     from pmsmtool.drive_maps.drive_map_file import dump_drive_map
     from pmsmtool.errors import CheckFailed, IdentificationError, Partial
     from pmsmtool.files import write_file
@@ -183,6 +180,8 @@ def _tell(
     if output is not None and rows and not against:
         write_file(output, dump_drive_map(map_with(drive, rows, currents.kind)))
         out.note(f"wrote {output}")
+    if stopped is not None:
+        raise stopped
     if against:
         raise CheckFailed(
             "; ".join(against), likely="the map is of another firmware, or of other settings of the drive",

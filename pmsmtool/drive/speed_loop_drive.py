@@ -24,7 +24,7 @@ from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S
 from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
-from pmsmtool.errors import BusError, LimitExceeded, NotAvailable, SdoAbort
+from pmsmtool.errors import LimitExceeded, NotAvailable, SdoAbort
 from pmsmtool.trace import Trace
 
 SHOWN = ("position", "current")
@@ -32,11 +32,6 @@ OSCILLATION_SAMPLES = 20
 """Periods of sampling over which an oscillation is judged."""
 LARGEST_COUNT = 2.0 * math.pi
 """Largest speed that one count of any drive's velocity is worth (rad/s): a turn per second."""
-LOOK_S, SPEED_OVER_S, SPEED_SAMPLES, BLIND_S, MOST_PERIOD_S = 0.01, 0.01, 16, 0.025, 0.005
-"""How often the speed over the last samples is looked at; over how long, and how many they are at most; without any so
-long, nothing is seen; longest period of samples."""
-SEEN_S = 0.04
-"""A shaft faster than :attr:`SpeedLoopDrive.fastest_rad_s` is seen, and the voltage off, within this time."""
 
 
 class Row(NamedTuple):
@@ -97,8 +92,6 @@ class SpeedLoopDrive(TorqueDrive):
         Whether the current that is shown was taken as rms without a source: a share of 0x6075 is, too.
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
-    fastest_rad_s : float
-        Speed by the last samples at which the voltage is removed; infinity: only the guard looks.
 
     Raises
     ------
@@ -128,8 +121,6 @@ class SpeedLoopDrive(TorqueDrive):
         self.read_as_rms = self.current_undecided or (of_standard and share)
         self.oscillation = Oscillation()
         self.sends = True
-        self.fastest_rad_s = math.inf
-        self._last: deque[tuple[float, float, float]] = deque(maxlen=SPEED_SAMPLES)
         self._sending: AbstractContextManager[LiveValues] | None = None
         self._samples: list[Row] = []
         self._due: list[tuple[float, float]] = []
@@ -175,7 +166,6 @@ class SpeedLoopDrive(TorqueDrive):
         self._sending = sending
 
         def note(stamp_s: float) -> None:
-            self._last.append((self.node.connection.clock.now(), stamp_s, live.values["position"]))
             if self._recording:
                 # an adapter's time stamps begin where they like; the shortest way here ties them to the clock
                 self._behind_s = min(self._behind_s, self.node.connection.clock.now() - stamp_s)
@@ -242,69 +232,20 @@ class SpeedLoopDrive(TorqueDrive):
                 self._written.append((0.5 * (before + clock.now()), self._counts(speed) * self.rad_s_per_count))
             if not self.sends:
                 self._ask()
-            self._look()
-            left = min([end, clock.now() + self._look_every_s, *(at for at, _ in self._due[:1])]) - clock.now()
+            until = min([end, *(at for at, _ in self._due[:1])])
+            left = (min(until, clock.now() + POLL_PERIOD_S) if not self.sends else until) - clock.now()
             if left > 0.0:
                 self.node.connection.wait(left)
             if end - clock.now() < RESOLUTION_S:
                 break
-        while math.isfinite(self.fastest_rad_s) and self.may_be_energised and end - clock.now() > RESOLUTION_S:
-            if not self.sends:
-                self._ask()
-            self._look()
-            self.node.connection.wait(max(0.0, min(self._look_every_s, end - clock.now())))
         super().wait(max(0.0, end - clock.now()))
-
-    def can_watch(self) -> bool:
-        """Return whether position comes often enough to see a shaft run away within ``SEEN_S``."""
-        began = self.node.connection.clock.now()
-        for _ in range(SPEED_SAMPLES):
-            if self.sends:
-                self.node.connection.wait(POLL_PERIOD_S)
-            else:
-                self._ask()
-        return self.node.connection.clock.now() - began < SPEED_SAMPLES * MOST_PERIOD_S and bool(self._last)
-
-    @property
-    def _look_every_s(self) -> float:
-        return LOOK_S if self.sends else POLL_PERIOD_S
-
-    def _look(self) -> None:
-        """Remove the voltage where the shaft runs away by its last samples, or a drive that sends them does no more.
-
-        Raises
-        ------
-        LimitExceeded, BusError
-            Which it is; the voltage is off.
-        """
-        if math.isinf(self.fastest_rad_s) or not self.may_be_energised:
-            return
-        last, where = list(self._last), f"node {self.node.node}"
-        if self.sends and self.node.connection.clock.now() - last[-1][0] > BLIND_S:
-            self.disable_at_once()
-            raise BusError(
-                f"no process data of the drive for {1e3 * BLIND_S:.0f} ms: its speed is not seen", where=where,
-                likely="the bus is busy, or this computer", hint="leave both to this program, then run it again",
-            )  # fmt: skip
-        _, ended, latest = last[-1]
-        _, began, first = next(sample for sample in last if ended - sample[1] < SPEED_OVER_S)
-        way = latest - first
-        way = 2.0 * math.pi * (way - round(way / 2.0**32) * 2.0**32) / self.counts_per_turn
-        if abs(way) > self.fastest_rad_s * (ended - began) > 0.0:
-            self.disable_at_once()
-            raise LimitExceeded(
-                "speed by its position", abs(way) / (ended - began), self.fastest_rad_s, "rad/s", where=where,
-                likely="the speed loop runs away", hint="the gains are restored; nothing was learned",
-            )  # fmt: skip
 
     def _ask(self) -> None:
         before = self.node.connection.clock.now()
         position = self.node.get(POSITION)
         between = self.node.connection.clock.now()
         current = self.node.get(self._current.item)
-        self._last.append((between, 0.5 * (before + between), position))
-        if self._recording:
-            self._take(0.5 * (before + between), position, current)
+        self._take(0.5 * (before + between), position, current)
 
     def _take(self, t_s: float, counts: float, current: float) -> None:
         if self._unwrapped is not None:

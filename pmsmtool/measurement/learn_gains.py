@@ -13,7 +13,7 @@ from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_spee
 from pmsmtool.drive.guard import WATCH_S, GuardedDrive
 from pmsmtool.drive.motion_objects import allowed, speed_limits
 from pmsmtool.drive.port import Excitation, Injection, Shape
-from pmsmtool.drive.speed_loop_drive import SEEN_S, SpeedLoopDrive
+from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
 from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.identification.learned_gains import BANDWIDTH_DOUBT, NO_DOUBT, Observation, emf_doubt, lag_doubt
 from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop, StepRecord, fit_speed_loop, phase_margin_rad
@@ -30,7 +30,7 @@ from pmsmtool.measurement.changed_gains import (
     refuse_unsafe,
 )
 from pmsmtool.measurement.speed_unit import find_speed_unit
-from pmsmtool.units import format_current, rad_s_from_rpm
+from pmsmtool.units import rad_s_from_rpm
 
 INTEGRAL_DOWN, LITTLE_DOWN = 0.8, 0.9
 """First change of an integral part: where it is a time, its gain rises by 1.25, less where the margin needs it."""
@@ -44,9 +44,6 @@ TRIP = 3.0
 """Oscillation over the one with the drive's own gains, at which the voltage is removed."""
 LOW_SHARE, HIGH_SHARE = 0.15, 0.7
 """Speeds between which the reference climbs and falls, of the speed limit."""
-WATCHED_LOW, WATCHED_HIGH, WATCHED_TRIP, WATCHED_HOLD_S = 0.1, 0.5, 0.6, 0.08
-"""The same on a drive without a speed limit of its own, the speed at which the voltage is removed there (the lower, the
-more current is allowed), and the shortest hold of its steps: held for 41 ms, K_i / K_p was 1.7 of the true one."""
 STEP_CURRENT = 0.5
 """Current of a step, of what drive and envelope allow: large against friction and the inverter's dead time."""
 FIRST_STEP = 0.02
@@ -56,7 +53,7 @@ CLIMB, RETURN = 0.3, 0.6
 """Acceleration of the reference up and back, of what a step begins with: on the way up the current keeps its sign, for
 after a step it swings back by up to a fifth of its peak, and through zero the inverter's dead time would delay it."""
 STEPS = (2, 6)
-"""Steps of one way up, at least and at most: one alone leaves several loops that answer so."""
+"""Steps of one way up, at least and at most."""
 TICK_S = 5e-3
 """Time between the small steps that make a climb."""
 FIRST_BANDWIDTH = 50.0
@@ -72,8 +69,8 @@ LEAST_AT_REST = 40
 SPEED_SHARE = 0.4
 """Speed limit where none is asked for, of the largest speed of the machine: no field weakening."""
 DURATION_S = 120.0
-LOOKED_S = 2.0 * WATCH_S
-"""A speed beyond its limit is seen by the guard and the voltage off within this time."""
+SEEN_S = 2.0 * WATCH_S
+"""A speed beyond its limit is seen and the voltage off within this time."""
 REST_S, REST_RAD = 0.3, 2e-3
 ROUNDING = 1.0 / math.sqrt(12.0)
 
@@ -89,29 +86,17 @@ class LearnedLoop:
     notes: Sequence[str]
 
 
-def within_budget(
-    drive: SpeedLoopDrive,
-    machine: MachineParameters,
-    i_max_apk: float,
-    speed_max_rad_s: float,
-    *,
-    watched: bool = False,
-) -> float:
+def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: float, speed_max_rad_s: float) -> float:
     """Return the largest current that cannot bring the shaft beyond the speed limit before this program sees it.
 
     The drive's speed loop keeps the speed, also when the tool is dead; this is for a loop that runs away. A drive with
     a speed limit of its own keeps it; of any other the current is cut.
-
-    Parameters
-    ----------
-    watched : bool
-        Whether position is read every few milliseconds, and the speed loop was seen to keep a speed.
     """
     acceleration = largest_acceleration(machine, i_max_apk)
     if allowed(drive.node, speed_limits(drive.node)) is not None or acceleration is None:
         return i_max_apk
-    share, seen_s = (WATCHED_TRIP, SEEN_S) if watched else (HIGH_SHARE, LOOKED_S)
-    return i_max_apk * min(1.0, (1.0 - share) * speed_max_rad_s / (acceleration * seen_s))
+    room = (1.0 - HIGH_SHARE) * speed_max_rad_s
+    return i_max_apk * min(1.0, room / (acceleration * SEEN_S))
 
 
 def learning_envelope(
@@ -126,8 +111,7 @@ def learning_envelope(
     """Return the limits within which gains are learned, from what was asked for."""
     machine = file.machine
     speed_max = speed_max_rad_s or SPEED_SHARE * rad_s_from_rpm(machine.top_rpm or 0.0)
-    asked = i_max_apk or min(drive.rated_apk, drive.shows_apk)
-    i_max = within_budget(drive, machine, asked, speed_max, watched=True)
+    i_max = within_budget(drive, machine, i_max_apk or min(drive.rated_apk, drive.shows_apk), speed_max)
     return Envelope(
         i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S, shaft=shaft or "free", load=load,
         brake=brake, acceleration_rad_s2=largest_acceleration(machine, i_max),
@@ -150,16 +134,10 @@ def learn_speed_loop(
     gain: GainObject,
     integral: GainObject,
     envelope: Envelope,
-    first_apk: float,
     emf: Emf,
     say: Callable[[str], None],
 ) -> LearnedLoop:
     """Measure the speed loop with the drive's own gains and with each changed; the drive is as before on return.
-
-    Parameters
-    ----------
-    first_apk : float
-        Largest current until the speed loop was seen to keep a speed (:func:`within_budget`, not watched).
 
     Raises
     ------
@@ -173,7 +151,7 @@ def learn_speed_loop(
     with changing(drive, (gain, integral), envelope, say) as (guard, put):
         drive.send_samples()
         try:
-            return _Learner(guard, drive, put, emf, say).run(gain, integral, first_apk)
+            return _Learner(guard, drive, put, emf, say).run(gain, integral)
         finally:
             guard.stop()
             drive.end_samples()
@@ -236,41 +214,14 @@ class _Learner:
         self.guard, self.drive, self.put, self.emf, self.say = guard, drive, put, emf, say
         limit = guard.envelope.speed_max_rad_s
         self.low, self.span = LOW_SHARE * limit, (HIGH_SHARE - LOW_SHARE) * limit
-        self.least_hold_s = HOLD_S[0]
-        self.most_apk = min(guard.envelope.i_max_apk, drive.current_limit_apk, drive.rated_apk)
         self.bandwidth, self.hold_s, self.settle_s = FIRST_BANDWIDTH, HOLD_TIMES / FIRST_BANDWIDTH, SETTLE_S
         self.notes: list[str] = []
 
-    def _find_speed_unit(self, first_apk: float) -> float:
-        """Turn the shaft by the drive's speed loop; then, where its samples are watched, allow the whole current."""
-        guard, drive = self.guard, self.drive
-        limit = guard.envelope.speed_max_rad_s
-        bounded = first_apk < guard.envelope.i_max_apk
-        if bounded:
-            kept = guard.limit_current(first_apk)
-            if kept is None:
-                raise NotAvailable(
-                    f"the drive does not let its current limit be lowered to {format_current(first_apk)}",
-                    where=f"node {drive.node.node}", likely="its steps are coarser",
-                    hint="without a speed limit in the drive, nothing else bounds a speed loop that runs away",
-                )  # fmt: skip
-        guard.enable()
-        unit = find_speed_unit(guard, drive, 0.5 * limit)
-        if bounded and drive.can_watch():
-            guard.stop()
-            guard.limit_current(guard.envelope.i_max_apk)
-            drive.fastest_rad_s = WATCHED_TRIP * limit
-            self.low, self.span = WATCHED_LOW * limit, (WATCHED_HIGH - WATCHED_LOW) * limit
-            self.least_hold_s = WATCHED_HOLD_S
-            guard.enable()
-        elif bounded:
-            self.most_apk = min(self.most_apk, first_apk)
-        return unit
-
-    def run(self, gain: GainObject, integral: GainObject, first_apk: float) -> LearnedLoop:
+    def run(self, gain: GainObject, integral: GainObject) -> LearnedLoop:
         """Measure everything."""
-        drive = self.drive
-        unit = self._find_speed_unit(first_apk)
+        guard, drive = self.guard, self.drive
+        guard.enable()
+        unit = find_speed_unit(guard, drive, 0.5 * guard.envelope.speed_max_rad_s)
         self.say(
             f"one count of 0x60FF is {unit:.5g} rad/s; the steps are taken between {self.low:.4g} and "
             f"{self.low + self.span:.4g} rad/s"
@@ -281,7 +232,7 @@ class _Learner:
         integral_s = self.bandwidth / own.loop.K_i_per_J
         self.settle_s = min(max(SETTLE_S, SETTLE_TIMES * integral_s), LONGEST_S)
         wanted_s = max(HOLD_TIMES / self.bandwidth, HOLD_INTEGRAL * integral_s)
-        self.hold_s = min(max(wanted_s, self.least_hold_s), HOLD_S[1])
+        self.hold_s = min(max(wanted_s, HOLD_S[0]), HOLD_S[1])
         step = self._size()
         own = self._observe(f"with steps held for {1e3 * self.hold_s:.0f} ms", step, counts, own.loop)
         drive.oscillation.limit_a = TRIP * max(drive.oscillation.largest_a, drive.current_count_a)
@@ -303,8 +254,8 @@ class _Learner:
 
     def _size(self) -> float:
         """Return the step of speed whose current is large against friction and small against every limit."""
-        drive = self.drive
-        wanted = STEP_CURRENT * self.most_apk
+        drive, guard = self.drive, self.guard
+        wanted = STEP_CURRENT * min(guard.envelope.i_max_apk, drive.current_limit_apk, drive.rated_apk)
         most = self.span / (STEPS[0] * self.risen)
         step = min(FIRST_STEP * self.span, most)
         for _ in range(TRIES):

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from types import SimpleNamespace
 
 import numpy as np
@@ -88,7 +87,6 @@ def stairs_drive(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> SpeedLoopDrive:
     drive.node = SimpleNamespace(node=1, connection=bus, get=bus.transfer, put=bus.transfer, supervision=supervision)  # type: ignore[assignment]
     drive.oscillation, drive.sends, drive.period_s, drive.rad_s_per_count = Oscillation(), False, PERIOD_S, 0.5
     drive.counts_per_turn, drive._polled = 4000.0, ()
-    drive.fastest_rad_s, drive._last = math.inf, deque()
     drive._current = SimpleNamespace(item=object(), per_count=0.1)  # type: ignore[assignment]
     monkeypatch.setattr(SpeedLoopDrive, "check_operating", lambda self: None)
     return drive
