@@ -120,7 +120,7 @@ def verdict_of(record: Mapping[str, Any], complete: Sequence[str] = COMPLETE) ->
         return Verdict("fail", STOP_NOT_CONFIRMED, (USE_HARDWARE_STOP, *failures, *accepted), simulated)
     if failures:
         ran = [stage for stage in latest if stage["status"] in RAN]
-        return Verdict("fail", "FAIL", (*failures, *accepted, *_refused(ran)), simulated)
+        return Verdict("fail", "FAIL", (*failures, *unmeasured, *accepted, *_refused(ran)), simulated)
     ran = [stage for stage in latest if stage["status"] in RAN]
     left = [*unmeasured, *_unchecked(latest, complete)]
     missing = [*_missing(latest, complete), *_unfinished(account, latest)]

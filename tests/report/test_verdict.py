@@ -73,6 +73,13 @@ def test_a_failed_run_says_what_was_refused_before() -> None:
     assert found.details == ("mechanics: refused: E_MODEL_MISMATCH: the shaft is not rigid",)
 
 
+def test_a_failed_run_says_what_it_follows_from_and_nobody_measured() -> None:
+    """A proof failed for an R twice the motor's, which the bridge hid: the verdict named no cause, and not R either."""
+    row = {"name": "R_s_ohm", "verdict": "NOT CHECKED", "source": "data sheet", "stated": 2.0, "text": ""}
+    identified = {**stage("identify", "partial"), "comparison": [row]}
+    assert verdict_of(record(identified, stage("prove", "fail"))).details == ("NOT CHECKED (data sheet): R",)
+
+
 def test_an_identification_that_gave_a_part_is_partial_and_names_the_rest() -> None:
     identified = stage("identify", "partial")
     identified["values"] = [value for value in identified["values"] if value["name"] != "psi_f_wb"]
