@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.encoder import PER_TURN_LEAST_RAD, PER_TURN_SURE, _per_turn
 from pmsmtool.estimators.flux import map_fit
@@ -22,11 +21,7 @@ from pmsmtool.estimators.shaft import frequency_response as fr
 from pmsmtool.estimators.shaft import mechanics, response_lines, swing
 from pmsmtool.estimators.shaft.model import Run
 from pmsmtool.trace import Trace
-
-
-def _trace(t: Array, meta: dict[str, Any] | None = None, **signals: Array) -> Trace:
-    return Trace(t, signals, dict.fromkeys(signals, "1"), meta or {})
-
+from tests.estimators.traces import trace_of
 
 # ---- which swing is one -----------------------------------------------------------------------------------------
 
@@ -41,7 +36,7 @@ def _swing_of(
 
     monkeypatch.setattr(swing, "_explained", lambda *_: explained)
     t = 3.0 + 1e-3 * np.arange(201)
-    return swing.swing_of([_trace(t, x=t), _trace(t[:101], x=t[:101])], lambda d, q: q, resonance, doubt)
+    return swing.swing_of([trace_of(t, x=t), trace_of(t[:101], x=t[:101])], lambda d, q: q, resonance, doubt)
 
 
 def test_a_swing_must_explain_half_of_what_a_rigid_shaft_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -101,7 +96,7 @@ def test_the_fast_part_of_the_traces_is_taken_where_it_needs_less_noise(
     noises: Sequence[float | None], whole: bool
 ) -> None:
     t = 0.01 * np.arange(400)
-    run = _trace(t, theta_M_rad=np.where(t < 2.0, 3.0 * t, 6.0 + 0.1 * (t - 2.0)))
+    run = trace_of(t, theta_M_rad=np.where(t < 2.0, 3.0 * t, 6.0 + 0.1 * (t - 2.0)))
     found = mechanics._explained(_fitted(noises), [run])
     assert (found[1] == 400) is whole
     with pytest.raises(IdentificationError, match="E_NOT_CONVERGED"):
@@ -163,7 +158,7 @@ def test_an_error_of_the_encoder_is_large_and_alike_in_both_directions(
     for sign in (1.0, -1.0):
         theta = np.arange(0.0, 2.0 * math.pi, 2.0 * math.pi / 720.0)
         off = size * np.cos(theta - 0.4) + sign * apart * np.cos(theta - 2.0) + 0.3 * size * np.sin(2.0 * theta)
-        runs.append(_trace(theta, theta_M_rad=theta, theta_imposed_rad=-5.0 * (theta - off)))
+        runs.append(trace_of(theta, theta_M_rad=theta, theta_imposed_rad=-5.0 * (theta - off)))
     found = _per_turn(runs[0], runs[1], -5)
     assert found[0] == pytest.approx(size if clear else 0.0, rel=1e-6, abs=1e-12)
     assert found[1] == pytest.approx(0.3 * size if 0.3 * size > PER_TURN_LEAST_RAD else 0.0, rel=1e-6, abs=1e-12)
@@ -171,7 +166,7 @@ def test_an_error_of_the_encoder_is_large_and_alike_in_both_directions(
 
 def test_one_pole_pair_has_orders_to_compare_with_too() -> None:
     theta = np.arange(0.0, 2.0 * math.pi, 2.0 * math.pi / 720.0)
-    run = _trace(theta, theta_M_rad=theta, theta_imposed_rad=theta - 0.01 * np.cos(theta))
+    run = trace_of(theta, theta_M_rad=theta, theta_imposed_rad=theta - 0.01 * np.cos(theta))
     assert _per_turn(run, run, 1) == pytest.approx((0.01, 0.0), abs=1e-9)
 
 
@@ -187,7 +182,7 @@ def test_a_torque_over_the_angle_that_one_mass_leaves_is_taken_along(amplitude: 
         theta = 25.0 * t + 0.5 * np.cumsum(rng.standard_normal(n)) * T
         torques.append(rng.standard_normal(n))
         ripples.append(amplitude * np.cos(order * theta - 0.6))
-        runs.append(_trace(t, theta_M_rad=-theta))
+        runs.append(trace_of(t, theta_M_rad=-theta))
     omega, U, _, _ = response_lines.transforms(runs, torques, -1)
     ripple = response_lines.transforms(runs, ripples, -1)[1]
     noise = rng.standard_normal(U.shape) + 1j * rng.standard_normal(U.shape)

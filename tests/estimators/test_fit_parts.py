@@ -32,14 +32,11 @@ from pmsmtool.estimators.shaft.inertia_ratio import FRICTION_FLOOR, MODEL_FLOOR,
 from pmsmtool.estimators.shaft.model import Run
 from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, local_polynomials
 from pmsmtool.trace import Trace
+from tests.estimators.traces import trace_of
 
 EXACT = 1e-9
 """The same numbers by another formula (relative); measured: below 1e-12."""
 T_S = 1e-4
-
-
-def _trace(t: Array, meta: dict[str, Any] | None = None, **signals: Array) -> Trace:
-    return Trace(t, signals, dict.fromkeys(signals, "1"), meta or {})
 
 
 def _fit(x: Sequence[float], cost: float, *, rows: int = 300, seed: int = 0, size: float = 100.0) -> Fit:
@@ -230,7 +227,7 @@ def _push(*, i_d: bool = True, turn: float = -5.0) -> Trace:
     s = t - 2.0
     theta = 0.5 * 90.0 * (s - 1e-3 * turn) ** 2
     signals = {"theta_M_rad": theta, "i_q_a": 3.0 + 2.0 * s}
-    return _trace(t, **signals, **({"i_d_a": 0.4 - s} if i_d else {}))
+    return trace_of(t, **signals, **({"i_d_a": 0.4 - s} if i_d else {}))
 
 
 def test_the_blocks_of_a_push_hold_speeds_and_integrals_without_their_means() -> None:
@@ -267,11 +264,12 @@ def test_each_way_of_a_push_has_a_first_speed_of_its_own() -> None:
 def test_a_push_too_short_out_of_order_or_at_rest_is_none() -> None:
     push = _push()
     assert (
-        inertia_ratio._part(_trace(push.t_s[:28], **{k: v[:28] for k, v in push.signals.items()}), 0.01, False)
+        inertia_ratio._part(trace_of(push.t_s[:28], **{k: v[:28] for k, v in push.signals.items()}), 0.01, False)
         is not None
     )
     assert (
-        inertia_ratio._part(_trace(push.t_s[:26], **{k: v[:26] for k, v in push.signals.items()}), 0.01, False) is None
+        inertia_ratio._part(trace_of(push.t_s[:26], **{k: v[:26] for k, v in push.signals.items()}), 0.01, False)
+        is None
     )
     stuck = push.t_s.copy()
     stuck[72:95] = stuck[72]
@@ -407,7 +405,7 @@ def test_friction_is_the_mean_of_models_with_and_without_drag(
     monkeypatch.setattr(mechanics, "encoder_errors", lambda *_: (Harmonic(1, 0.0, 0.0, 0.0),))
     t = 1e-2 * np.arange(101.0)
     traces = [
-        _trace(t, {"coasting": k % 2 == 1}, theta_M_rad=0.01 * np.floor(1e2 * (t + t * t)), flagged=0.0 * t)
+        trace_of(t, {"coasting": k % 2 == 1}, theta_M_rad=0.01 * np.floor(1e2 * (t + t * t)), flagged=0.0 * t)
         for k in range(4)
     ]
     found = mechanics.estimate_mechanics(
@@ -441,7 +439,7 @@ def test_friction_is_the_mean_of_models_with_and_without_drag(
 
 def test_means_of_halves_are_doubted_by_their_scatter_and_the_torques_scale(monkeypatch: pytest.MonkeyPatch) -> None:
     t = 1e-2 * np.arange(101.0)
-    traces = [_trace(t, {"coasting": k % 2 == 1}, theta_M_rad=0.01 * np.floor(1e2 * (t + t * t)), flagged=0.0 * t,
+    traces = [trace_of(t, {"coasting": k % 2 == 1}, theta_M_rad=0.01 * np.floor(1e2 * (t + t * t)), flagged=0.0 * t,
                      i_d_a=0.0 * t, i_q_a=0.5 + 0.0 * t) for k in range(4)]  # fmt: skip
     for stds, kept in (([1e-5, 1e-3, 0.02], 3), ([1e-5, 0.1, 0.02], 1), ([1e-5, 1e-3, 0.3], 1)):
         monkeypatch.setattr(
@@ -471,7 +469,7 @@ def test_a_swing_explains_the_share_of_a_regression_beside_the_rigid_shaft() -> 
         + 0.01 * np.exp(-0.05 * 500.0 * t) * np.cos(500.0 * t + 0.7)
         + 1e-3 * rng.standard_normal(300)
     )
-    push = _trace(5.0 + t, theta_M_rad=theta, i_d_a=0.0 * t, i_q_a=i)
+    push = trace_of(5.0 + t, theta_M_rad=theta, i_d_a=0.0 * t, i_q_a=i)
     explained = swing._explained([push], lambda d, q: 0.7 * q)
     half = 1 + 300 // 100
     turning = np.sign([theta[min(k + half, 299)] - theta[max(k - half, 0)] for k in range(300)])

@@ -41,14 +41,11 @@ from pmsmtool.estimators.resolved_push import (
 )
 from pmsmtool.estimators.shaft.inertia_ratio import jackknife_variance, regress
 from pmsmtool.trace import Trace
+from tests.estimators.traces import trace_of
 
 EXACT = 1e-9
 """The same numbers by another formula (relative); measured: below 1e-10."""
 T_S = 1e-4
-
-
-def _trace(t: Array, meta: dict[str, float] | None = None, **signals: Array) -> Trace:
-    return Trace(t, signals, dict.fromkeys(signals, "1"), meta or {})
 
 
 # ---- recorded: judgement ----------------------------------------------------------------------------------------
@@ -73,7 +70,7 @@ def _judged(
     found = Resolved(np.array([R_ohm, psi_q, PSI_D, L_Q, V_DEAD]), std, 40.0, 700)
     monkeypatch.setattr(recorded_push, "push_blocks", lambda *_: next(blocks))
     monkeypatch.setattr(recorded_push, "resolve", lambda _: found)
-    pushes = [_trace(np.zeros(1), meta) for meta in doubts]
+    pushes = [trace_of(np.zeros(1), meta) for meta in doubts]
     return estimate_pushes(pushes, period_s=T_S, pole_pairs=3, tolerance=tolerance)
 
 
@@ -132,7 +129,7 @@ def _push(blocks: int = 20, *, flagged: Array | None = None, sense: float = 1.0)
     n = blocks * BLOCK + 3  # three samples are left over
     t = 2.0 + 5e-4 * np.arange(n)
     s = t - t[0]
-    return _trace(
+    return trace_of(
         t, i_d_a=0.2 + 0.5 * s, i_q_a=4.0 + 2.0 * s, u_d_v=-3.0 + 40.0 * s, u_q_v=20.0 + 90.0 * s,
         theta_M_rad=sense * (30.0 * s + 0.5 * 800.0 * s**2), omega_e_rad_s=3.0 * (30.0 + 800.0 * s) - 3.0,
         flagged=np.zeros(n) if flagged is None else flagged,

@@ -34,14 +34,11 @@ from pmsmtool.estimators.shaft.disturbances import ANGLE_STD, ELECTRICAL_STD, EN
 from pmsmtool.estimators.tracking import INFLATION_MAX, MINIMUM, NIS_GATE, NOISE_FLOOR, Track
 from pmsmtool.estimators.tracking_model import Known
 from pmsmtool.trace import Trace
+from tests.estimators.traces import trace_of
 
 EXACT = 1e-9
 """The same numbers by another formula (relative); measured: below 1e-12."""
 T_S = 1e-4
-
-
-def _trace(t: Array, meta: dict[str, Any] | None = None, **signals: Array) -> Trace:
-    return Trace(t, signals, dict.fromkeys(signals, "1"), meta or {})
 
 
 def _pair(vector: Complex) -> Array:
@@ -61,7 +58,7 @@ def test_pulses_are_integrated_in_the_frame_of_the_stator(lag: int) -> None:
     t = T_S * np.arange(n)
     i, u = (rng.standard_normal(n) + 1j * rng.standard_normal(n) for _ in range(2))
     meta = {"voltage_lag": lag, "control_period_s": T_S}
-    trace = _trace(t, meta, theta_M_rad=0.2 + 30.0 * t, omega_e_rad_s=np.full(n, 61.0), i_d_a=i.real, i_q_a=i.imag,
+    trace = trace_of(t, meta, theta_M_rad=0.2 + 30.0 * t, omega_e_rad_s=np.full(n, 61.0), i_d_a=i.real, i_q_a=i.imag,
                    u_d_v=20.0 * u.real, u_q_v=20.0 * u.imag)  # fmt: skip
     found = integrate_pulses(trace, Frame(2, 0.1, 0.15), CURVE, 0.4)
     turned = 2.0 * (0.2 + 30.0 * t) - 0.1
@@ -142,7 +139,7 @@ def _run(*, coasting: bool, powered: bool = False, n: int = 1006) -> Trace:
     t = 1e-3 * np.arange(n)
     rng = np.random.default_rng(93)
     meta = {"coasting": coasting, "powered": powered}
-    return _trace(
+    return trace_of(
         t,
         meta,
         theta_M_rad=-(0.4 + 12.0 * t + 3.0 * t**2),
@@ -271,7 +268,7 @@ def test_records_go_in_with_cogging_and_without_the_noise_of_their_current(monke
     rng = np.random.default_rng(95)
     n = 3000
     t = 2e-4 * np.arange(n)
-    runs = [_trace(t, theta_M_rad=-(20.0 * t + 1e-3 * rng.standard_normal(n)), i_d_a=rng.standard_normal(n),
+    runs = [trace_of(t, theta_M_rad=-(20.0 * t + 1e-3 * rng.standard_normal(n)), i_d_a=rng.standard_normal(n),
                    i_q_a=rng.standard_normal(n), flagged=np.zeros(n)) for _ in range(3)]  # fmt: skip
     given: list[Any] = []
 
@@ -303,7 +300,7 @@ def test_records_go_in_with_cogging_and_without_the_noise_of_their_current(monke
 def test_records_must_be_three_of_one_length_that_turn_and_are_not_limited() -> None:
     n = 3000
     t = 2e-4 * np.arange(n)
-    good = _trace(t, theta_M_rad=20.0 * t, i_d_a=np.zeros(n), i_q_a=np.zeros(n), flagged=np.zeros(n))
+    good = trace_of(t, theta_M_rad=20.0 * t, i_d_a=np.zeros(n), i_q_a=np.zeros(n), flagged=np.zeros(n))
     stopped = replace(good, signals={**good.signals, "theta_M_rad": np.abs(t - 0.3)})
     short = replace(good, t_s=t[:-1], signals={name: x[:-1] for name, x in good.signals.items()})
     limited = replace(good, signals={**good.signals, "flagged": np.where(t < 3.5e-4, 2.0, 0.0)})
@@ -329,7 +326,7 @@ def _observations(n: int) -> Trace:
     w_s = w * np.sin(x) / x
     u_d = 0.5 * i_d - w_s * 3e-3 * i_q
     u_q = 0.5 * i_q + w_s * (0.1 + 2e-3 * i_d)
-    return _trace(0.1 * np.arange(float(n)), i_d_a=i_d, i_q_a=i_q, omega_e_rad_s=w, u_d_v=u_d, u_q_v=u_q)
+    return trace_of(0.1 * np.arange(float(n)), i_d_a=i_d, i_q_a=i_q, omega_e_rad_s=w, u_d_v=u_d, u_q_v=u_q)
 
 
 def test_the_noise_of_observations_is_that_of_their_second_differences() -> None:

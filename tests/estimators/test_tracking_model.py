@@ -5,12 +5,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 
-from pmsmtool.arrays import Array
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking_model import (
     Known,
@@ -23,14 +21,11 @@ from pmsmtool.estimators.tracking_model import (
     windows,
 )
 from pmsmtool.trace import Trace
+from tests.estimators.traces import trace_of
 
 EXACT = 1e-9
 """The same numbers by another formula (relative); measured: below 1e-12."""
 T_S = 1e-4
-
-
-def _trace(t: Array, meta: dict[str, Any] | None = None, **signals: Array) -> Trace:
-    return Trace(t, signals, dict.fromkeys(signals, "1"), meta or {})
 
 
 CURVE = InverterCurve(np.array([0.5, 1.0, 4.0]), np.array([0.4, 0.8, 1.0]), 0.0)
@@ -68,7 +63,7 @@ def test_the_start_of_a_track_is_what_is_known() -> None:
 
 def _rows(n: int = 46) -> Trace:
     k = np.arange(float(n))
-    return _trace(0.01 * k, u_d_v=k, u_q_v=-k, i_d_a=1.0 + 0.02 * k, i_q_a=3.0 - 0.01 * k, omega_e_rad_s=100.0 + k,
+    return trace_of(0.01 * k, u_d_v=k, u_q_v=-k, i_d_a=1.0 + 0.02 * k, i_q_a=3.0 - 0.01 * k, omega_e_rad_s=100.0 + k,
                   T_winding_c=20.0 + k, flags=np.where(k == 13.0, 4.0, 0.0))  # fmt: skip
 
 
@@ -82,26 +77,28 @@ def test_windows_are_means_and_rises_of_their_rows() -> None:
     assert found["omega_rise_rad_s"] == pytest.approx(np.full(5, 10.0))
     assert found["limited"].tolist() == [0.0, 1.0, 0.0, 0.0, 0.0] and windows(_rows(), 9, 0.5).meta["window_s"] == 4.5
     with pytest.raises(ValueError, match="has no u_q_v"):
-        windows(_trace(np.arange(3.0), **{n: np.arange(3.0) for n in ("u_d_v", "i_d_a", "i_q_a", "omega_e_rad_s")}), 1)
+        windows(
+            trace_of(np.arange(3.0), **{n: np.arange(3.0) for n in ("u_d_v", "i_d_a", "i_q_a", "omega_e_rad_s")}), 1
+        )
 
 
 def test_windows_of_a_transient_and_the_next_are_left_out() -> None:
     n = 60
     base = windows(_rows(9 * n), 9)
     rises = {name: np.full(n, 1e-4) for name in ("d_rise_a", "q_rise_a", "omega_rise_rad_s")}
-    part = _trace(base.t_s, **{**base.signals, **rises, "limited": np.zeros(n)})
+    part = trace_of(base.t_s, **{**base.signals, **rises, "limited": np.zeros(n)})
     largest, fastest = np.max(np.hypot(part["i_d_a"], part["i_q_a"])), np.max(part["omega_e_rad_s"])
     for name, size in (("d_rise_a", largest), ("q_rise_a", largest), ("omega_rise_rad_s", fastest)):
         for share, gone in ((-0.049, []), (0.049, []), (0.051, [20, 21]), (-0.051, [20, 21])):
             rise = rises[name].copy()
             rise[20] = share * size
-            kept = steady([_trace(part.t_s, **{**part.signals, name: rise})])[0]
+            kept = steady([trace_of(part.t_s, **{**part.signals, name: rise})])[0]
             assert kept.t_s == pytest.approx(np.delete(part.t_s, gone))
-    noisy = _trace(
+    noisy = trace_of(
         part.t_s, **{**part.signals, "d_rise_a": np.full(n, 0.02 * largest) + 0.07 * largest * (np.arange(n) == 5)}
     )
     assert len(steady([noisy])[0]) == n  # five times the median is more than a twentieth
-    limited = _trace(part.t_s, **{**part.signals, "limited": (np.arange(n) == 3).astype(float)})
+    limited = trace_of(part.t_s, **{**part.signals, "limited": (np.arange(n) == 3).astype(float)})
     assert len(steady([limited])[0]) == n - 1
 
 
@@ -131,9 +128,9 @@ def test_a_window_keeps_what_the_mean_of_its_rows_leaves_of_the_sixth_harmonic()
         across = np.array([-along[1], along[0]])
         expected.append(e * left * np.hypot(12.0 / 35.0 * np.abs(across), 2.0 / 35.0 * np.abs(along)))
     assert ripple_v(found, given) == pytest.approx(np.array(expected), rel=1e-6)
-    still = _trace(found.t_s, dict(found.meta), **{**found.signals, "omega_e_rad_s": np.zeros(5)})
+    still = trace_of(found.t_s, dict(found.meta), **{**found.signals, "omega_e_rad_s": np.zeros(5)})
     whole = ripple_v(still, given)
     assert np.max(np.hypot(*whole.T)) == pytest.approx(
         np.max(np.hypot(given[:, 3], given[:, 4])) * math.hypot(12.0, 2.0) / 35.0
     )
-    assert not np.any(ripple_v(_trace(found.t_s, **found.signals), given))
+    assert not np.any(ripple_v(trace_of(found.t_s, **found.signals), given))
