@@ -353,7 +353,7 @@ class CanopenDrive:
                 f"the drive left operation during a measurement: it is in {state_text(state)}",
                 where=f"node {self.node.node}",
                 likely="its safe torque off (STO) or enable input opened, it missed the tool's heartbeat because this "
-                "computer was busy, or another program stopped it",
+                "computer or the bus was busy, or another program stopped it",
                 hint="run the command again; nothing of this measurement was used",
             )
 
