@@ -48,6 +48,16 @@ def profile(name: str, **simulation: Any) -> str:
     return "drive.toml?nv=drive.nv"
 
 
+@pytest.mark.chain
+def test_a_record_that_is_read_on_a_slow_bus_leaves_room_for_the_heartbeat(tool: Tool) -> None:
+    """Its segments have the lower identifier: the drive missed the heartbeat, and switched off."""
+    channel = "interior-2k2?nv=:memory:&bitrate=125000"
+    code, out, err = tool("identify", "L", "-i", "pmsmsim", "-c", channel, "-b", "125000", "--yes", "--json")
+    assert code == 0, err
+    found = {row["name"] for row in json.loads(out)["values"]}
+    assert {"L_d_h", "L_q_h"} <= found
+
+
 @pytest.mark.parametrize("command", ["check", "identify", "commission"])
 def test_a_drive_that_answers_late_is_refused_before_its_objects_are_read(command: str, tool: Tool) -> None:
     Path("late.toml").write_text('[[frame]]\naction = "delay"\ndelay_s = 0.45\nids = "0x581"\n')

@@ -310,13 +310,3 @@ def test_a_guard_that_has_ended_enables_nothing(bench: SimBench) -> None:
     with pytest.raises(SafetyRefusal, match="the guard has ended"):
         guard.enable()
     assert bench.session.power.state is State.SWITCH_ON_DISABLED
-
-
-@pytest.mark.parametrize("bitrate", [125_000, 1_000_000])
-def test_a_record_read_on_a_slow_bus_leaves_room_for_the_heartbeat(bitrate: int) -> None:
-    """The segments have the lower identifier: the heartbeat goes between two blocks."""
-    with sim_bench(bitrate=str(bitrate)) as bench, guarded(bench.drive, ENVELOPE) as lent:
-        lent.enable()
-        lent.record(("i_d_a", "i_q_a", "theta_e_rad"), 600)
-        assert bench.session.power.state is State.OPERATION_ENABLED
-        lent.disable()
