@@ -13,6 +13,7 @@
 #define STEP_HALVINGS 24    /* of a step along a curve */
 #define TURN_COSINE 0.94    /* a step may turn the tangent by 20 degrees */
 #define STEP_FORWARD 0.5    /* and must get so far, of its length: a correction may throw a long one back */
+#define EDGE_NODES 18       /* of one side of the rectangle */
 #define HALF_PI 1.57079632679489661923
 
 static double larger(double a, double b)
@@ -374,9 +375,9 @@ static void add_piece(pmsm_border *border, const pmsm_plane *plane, enum pmsm_cu
     border->n_pieces++;
 }
 
-static int32_t inside_rectangle(const pmsm_rectangle *r, double d, double q, double slack)
+static int32_t inside_rectangle(const pmsm_rectangle *r, double d, double q)
 {
-    return d >= r->d_low - slack && d <= r->d_high + slack && q >= r->q_low - slack && q <= r->q_high + slack;
+    return d >= r->d_low && d <= r->d_high && q >= r->q_low && q <= r->q_high;
 }
 
 static int32_t sorted_insert(double *list, int32_t n, double value)
@@ -410,13 +411,13 @@ static void add_arcs(pmsm_border *border, const pmsm_plane *plane, double radius
     }
     for (int32_t k = 0; k + 1 < n; k++) {
         const double middle = 0.5 * (angle[k] + angle[k + 1]), width = angle[k + 1] - angle[k];
-        if (width > 1e-12 && inside_rectangle(r, radius * cos(middle), radius * sin(middle), 0.0))
+        if (width > 1e-12 && inside_rectangle(r, radius * cos(middle), radius * sin(middle)))
             add_piece(border, plane, PMSM_CURVE_CIRCLE, radius, angle[k], angle[k + 1],
                       2 + (int32_t)(nodes_per_turn * width / (4.0 * HALF_PI)));
     }
 }
 
-static void add_lines(pmsm_border *border, const pmsm_plane *plane, double radius, int32_t nodes_per_turn)
+static void add_lines(pmsm_border *border, const pmsm_plane *plane, double radius)
 {
     const pmsm_rectangle *r = &border->rectangle;
     for (int32_t k = 0; k < 2; k++) {
@@ -424,12 +425,12 @@ static void add_lines(pmsm_border *border, const pmsm_plane *plane, double radiu
         if (fabs(d) < radius) {
             const double reach = sqrt(square(radius) - square(d));
             add_piece(border, plane, PMSM_CURVE_VERTICAL, d, larger(-reach, r->q_low), smaller(reach, r->q_high),
-                      nodes_per_turn / 4);
+                      EDGE_NODES);
         }
         if (fabs(q) < radius) {
             const double reach = sqrt(square(radius) - square(q));
             add_piece(border, plane, PMSM_CURVE_HORIZONTAL, q, larger(-reach, r->d_low), smaller(reach, r->d_high),
-                      nodes_per_turn / 4);
+                      EDGE_NODES);
         }
     }
 }
@@ -442,7 +443,7 @@ void pmsm_border_build(const pmsm_plane *plane, const pmsm_rectangle *rectangle,
     border->n_nodes = 0;
     add_arcs(border, plane, radius, nodes_per_turn);
     if (with_lines)
-        add_lines(border, plane, radius, nodes_per_turn);
+        add_lines(border, plane, radius);
     for (int32_t k = 0; k < border->n_pieces; k++)
         border->piece[k].curve.rectangle = &border->rectangle;
 }

@@ -231,7 +231,6 @@ static int32_t solve_everywhere(const pmsm_contours *all, double T, double omega
     int32_t have = 0;
     want.room = want.V2 - 2.0 * all->plane->R * omega * T;
     c.curve = (pmsm_curve){all->plane, &all->border.rectangle, PMSM_CURVE_TORQUE, T, omega, V * V, T};
-    c.whole = 1;
     for (int32_t p = 0; p < all->border.n_pieces; p++) {
         const pmsm_piece *piece = &all->border.piece[p];
         pmsm_curve along = piece->curve;

@@ -27,6 +27,12 @@ static int32_t extremes_on(const pmsm_plane *plane, const pmsm_border *border, p
     return found;
 }
 
+/* Whether one torque lies further out than another: up on side 1, down on side 0. */
+static int32_t further(int32_t side, double t, double than)
+{
+    return side ? t > than : t < than;
+}
+
 static void build_locus(pmsm_contours *all)
 {
     const pmsm_rectangle *r = &all->border.rectangle;
@@ -44,15 +50,13 @@ static void build_locus(pmsm_contours *all)
             break;
         for (int32_t side = 0; side < 2; side++) {
             pmsm_locus *to = &all->least[side];
-            const double sign = side ? 1.0 : -1.0;
-            if (sign * extreme[side].t > sign * to->at[to->n - 1].t)
+            if (further(side, extreme[side].t, to->at[to->n - 1].t))
                 to->at[to->n++] = extreme[side];
         }
     }
     for (int32_t side = 0; side < 2; side++) { /* the domain's own extreme closes the locus */
         pmsm_locus *to = &all->least[side];
-        const double sign = side ? 1.0 : -1.0;
-        if (sign * all->bound[side].t > sign * to->at[to->n - 1].t)
+        if (further(side, all->bound[side].t, to->at[to->n - 1].t))
             to->at[to->n++] = all->bound[side];
     }
 }
@@ -108,11 +112,11 @@ static int32_t least_current(const pmsm_contours *all, const pmsm_curve *curve, 
 {
     const int32_t side = curve->level >= 0.0;
     const pmsm_locus *on = &all->least[side];
-    const double sign = side ? 1.0 : -1.0, T = sign * curve->level;
+    const double T = curve->level;
     const pmsm_point *a, *b;
     double x;
     int32_t k = 1;
-    while (k < on->n - 1 && sign * on->at[k].t < T)
+    while (k < on->n - 1 && further(side, T, on->at[k].t))
         k++;
     if (on->n < 2) {
         *at = on->at[0];
@@ -120,11 +124,11 @@ static int32_t least_current(const pmsm_contours *all, const pmsm_curve *curve, 
     }
     a = &on->at[k - 1];
     b = &on->at[k];
-    if (T == sign * b->t || T == sign * a->t) {
-        *at = T == sign * b->t ? *b : *a;
+    if (T == b->t || T == a->t) {
+        *at = T == b->t ? *b : *a;
         return 1;
     }
-    x = (curve->level - a->t) / (b->t - a->t);
+    x = (T - a->t) / (b->t - a->t);
     pmsm_plane_at(all->plane, a->d + x * (b->d - a->d), a->q + x * (b->q - a->q), at);
     if (!pmsm_curve_correct(curve, at))
         return 0;
@@ -135,15 +139,6 @@ static int32_t least_current(const pmsm_contours *all, const pmsm_curve *curve, 
 }
 
 /* ---- contour --------------------------------------------------------------------------------------- */
-
-static int32_t still_useful(const pmsm_contour *c, const pmsm_point *at, double length)
-{
-    double tangent[2], dh, dg;
-    pmsm_curve_tangent(&c->curve, at, tangent);
-    dh = length * (at->d * tangent[0] + at->q * tangent[1]);
-    dg = length * (at->g_d * tangent[0] + at->g_q * tangent[1]);
-    return !(dh > 0.0 && dg > 0.0); /* beyond, current and flux both rise: no speed wants that */
-}
 
 void pmsm_contour_trace(pmsm_contour *c, int32_t which, double length)
 {
@@ -167,8 +162,6 @@ void pmsm_contour_trace(pmsm_contour *c, int32_t which, double length)
         }
         to->rising &= next->h >= from->h;
         to->n++;
-        if (!c->whole && !still_useful(c, next, length))
-            return;
     }
 }
 
@@ -178,7 +171,6 @@ int32_t pmsm_contour_start(const pmsm_contours *all, double T, pmsm_contour *c)
     double tangent[2];
     c->curve = (pmsm_curve){all->plane, &all->border.rectangle, PMSM_CURVE_TORQUE, T, 0.0, 0.0, T};
     c->side[0].traced = c->side[1].traced = 0;
-    c->whole = 0;
     if (!least_current(all, &c->curve, &c->start))
         return 0;
     if (!(c->start.t_d * c->start.t_d + c->start.t_q * c->start.t_q > 0.0)) {

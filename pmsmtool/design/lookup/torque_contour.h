@@ -34,7 +34,6 @@ typedef struct {
     pmsm_curve curve;
     pmsm_point start;
     double first_length;     /* signed step of side 0 */
-    int32_t whole;           /* 1: traced to the edge of the domain, whatever current and flux do */
     pmsm_branch side[2];
 } pmsm_contour;
 
@@ -44,8 +43,7 @@ void pmsm_contours_prepare(const pmsm_plane *plane, pmsm_contours *all);
 /* The contour of a torque level T at its point of least current, not yet traced; 0: no such point in the domain. */
 int32_t pmsm_contour_start(const pmsm_contours *all, double T, pmsm_contour *c);
 
-/* Trace one side by steps of a signed length, to the edge of the domain or, unless whole, as far as it may be useful:
- * where current and flux both rise, no speed wants what follows. */
+/* Trace one side by steps of a signed length, to the edge of the domain. */
 void pmsm_contour_trace(pmsm_contour *c, int32_t which, double length);
 
 #endif
