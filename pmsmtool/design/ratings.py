@@ -274,5 +274,5 @@ def voltage_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict
 
 def _encoder(source: MachineFile) -> dict[str, DesignValue]:
     encoder, offset = source.encoder, math.remainder(source.encoder.offset_rad, 2.0 * math.pi)
-    given = {"encoder.offset_rad": offset, "encoder.reversed": float(encoder.direction < 0), **encoder.halls}
+    given = {"encoder.offset_rad": offset, "encoder.reversed": float(encoder.direction == -1), **encoder.halls}
     return {name: DesignValue(value, GIVEN) for name, value in given.items()}

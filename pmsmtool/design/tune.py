@@ -258,7 +258,7 @@ def _design_speed(
         )  # fmt: skip
     how = f"{gains.method}, {gains.omega_c / (2.0 * math.pi):.4g} Hz"
     slope, why = ACCELERATION_SHARE * rated.tau_max_nm / J * RPM, f"{ACCELERATION_SHARE:g} tau_max / J"
-    if ramp_limit < math.inf and FW_SHARE * ramp_limit < slope:
+    if FW_SHARE * ramp_limit < slope:
         slope, why = FW_SHARE * ramp_limit, f"{FW_SHARE:g} of the slope that spends the voltage reserve"
     values |= {
         "speed.K_p_nms_per_rad": DesignValue(gains.K_p, how, "speed"),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -12,19 +13,28 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from pmsmtool.design import field_weakening, polar
-from pmsmtool.design.lookup import table
+from pmsmtool.design import field_weakening, governor, polar
+from pmsmtool.design import tune as tuning
+from pmsmtool.design.admissible_set import Horizon, PredictionModel
+from pmsmtool.design.lookup import grid, table
 from pmsmtool.design.lookup.design import LookupRequest, _fitting
-from pmsmtool.design.lookup.grid import table_words
+from pmsmtool.design.lookup.grid import GridBounds, table_words
+from pmsmtool.design.lookup.table import LookupTable, speed_table
+from pmsmtool.design.loops.bandwidth import choose_current
 from pmsmtool.design.loops.current_loop import second_order
+from pmsmtool.design.loops.margins import margin_problem
+from pmsmtool.design.loops.open_loops import CURRENT_GAINS, smaller_gains
+from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import pole_placement, symmetric_optimum
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.design.polar_map import share_above
-from pmsmtool.design.polar_values import _options
-from pmsmtool.design.tune import _notch, tune
+from pmsmtool.design.polar_values import _facts, _options
+from pmsmtool.design.ratings import Ratings, ratings
+from pmsmtool.design.tune import NOTCH_RATE_SHARE, _notch, tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.parameters import MachineParameters
 
 PROFILE = Path(__file__).resolve().parents[2] / "profiles" / "interior-2k2.toml"
 ROUNDING = 1e-12  # relative; measured 2e-16
@@ -88,6 +98,7 @@ def test_a_notch_needs_a_rate_that_shows_the_resonance() -> None:
     assert _notch(swings, TuneRequest(), 1e-3)[0].hz == 50.0
     notch, _, notes = _notch(swings, TuneRequest(), 20e-3)
     assert notch.hz == 0.0 and notes[0].endswith("rate, 50 Hz")
+    assert _notch(swings, TuneRequest(), NOTCH_RATE_SHARE / 50.0)[0].hz == 0.0
 
 
 def test_where_the_largest_torque_stays_outside_the_circle() -> None:
@@ -113,6 +124,23 @@ def test_gains_of_the_coefficient_diagram_method() -> None:
     gain = math.cos(delta)
     assert (found.K_P21, found.K_I21) == pytest.approx((K_P / gain, K_I / gain), rel=ROUNDING)
     assert (found.K_P12, found.K_I12) == pytest.approx((-K_P / (V_a * gain), -K_I / (V_a * gain)), rel=ROUNDING)
+    # (37): the d axis is slowed down below a hundredth of the voltage, V_a cos delta
+    K_I12 = polar.cdm_gains(surface, 0.2, 0.0, 20.0, 1e-4, tau).K_I12
+    assert K_I12 == pytest.approx(-polar.CDM_GAMMA / tau**2 * 1e-3 / 0.2, rel=ROUNDING)
+    V_d = 0.3 * math.cos(1.2)
+    K_I12 = polar.cdm_gains(surface, 0.3, 1.2, 20.0, 1e-4, tau).K_I12
+    slowed = 0.1 * 20.0 / V_d * 1e-4
+    assert K_I12 == pytest.approx(-polar.CDM_GAMMA / slowed**2 * 1e-3 / V_d, rel=ROUNDING)
+
+
+def test_how_far_inductances_may_differ_for_the_polar_laws() -> None:
+    """L_d and L_q of 101 and 99 differ by the limit, 2 % of their mean."""
+    at_limit = MachineParameters(4, 0.5, 101.0, 99.0, 0.02)
+    assert polar.SurfaceMachine.of(at_limit).L_s_h == 100.0
+    with pytest.raises(DesignInfeasible, match=r"differ by 2\.1 %"):
+        polar.SurfaceMachine.of(replace(at_limit, L_d_h=101.1))
+    standing = cast(Ratings, SimpleNamespace(base_speed_rpm=0.0))
+    assert _facts(polar.SurfaceMachine(0.5, 1e-3, 0.02, 4), standing, 20.0) == {}
 
 
 def test_a_delay_of_one_period_can_be_predicted() -> None:
@@ -120,3 +148,80 @@ def test_a_delay_of_one_period_can_be_predicted() -> None:
     source = replace(machine, inverter=replace(machine.inverter, delay_periods=1.0))
     design = tune(source, TuneRequest(predictor=True, field_weakening="off", governor="off"))
     assert design.request["predictor"] is True and design.content_hash().startswith("sha256:")
+    assert margin_problem(design).predictor
+
+
+def test_margins_asked_for_are_met_by_a_loop_that_just_has_them() -> None:
+    source = load_machine_file(PROFILE)
+    choice = choose_current(source, TuneRequest(), 20.0)
+    loops = choice.loops().values()
+    phase_deg, gain_db = min(one.phase_margin_deg for one in loops), min(one.gain_margin_db for one in loops)
+    for phase, gain, met in ((phase_deg, gain_db, True), (phase_deg + 1e-9, 1.0, False), (1.0, gain_db + 1e-9, False)):
+        asked = replace(choice.request, phase_margin_deg=phase, gain_margin_db=gain)
+        assert replace(choice, request=asked).meets_request() is met
+
+
+def test_a_loop_on_its_limit_is_not_stable_and_has_no_gain_margin() -> None:
+    """L = 2/(z - 1) closes to a pole at -1: L = -1 at the Nyquist frequency."""
+    found = margins(SampledLoop((2.0,), (1.0, -1.0), 1.0))
+    assert (found.stable, found.gain_margin, found.gain_reduction) == (False, math.inf, 0.0)
+
+
+def test_a_noisy_speed_slows_its_loop_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The symmetric optimum's K_p is J omega_c."""
+    source, request = load_machine_file(PROFILE), TuneRequest()
+    rated = ratings(source, 0.9 * source.inverter.V_max_v)
+    choice = choose_current(source, request, rated.I_max_apk)
+
+    def K_p() -> float:
+        return tuning._design_speed(source, request, rated, choice, math.inf).values["speed.K_p_nms_per_rad"].value
+
+    quiet = K_p()
+    monkeypatch.setattr(tuning, "quieter", lambda *_: (0.5, "it is loud"))
+    assert K_p() == pytest.approx(0.5 * quiet, rel=ROUNDING)
+
+
+def test_one_pair_of_gains_alone_has_a_smaller_one() -> None:
+    d, _, q, _ = CURRENT_GAINS
+    assert smaller_gains({d: 2.0, q: 1.0}, {q}) == {d: 1.0, q: 1.0}
+    assert smaller_gains({q: 1.0}, {q}) == {}
+
+
+def test_horizons_that_the_drive_can_hold() -> None:
+    model = cast(PredictionModel, None)
+    assert not Horizon(0, None).by_tolerance and Horizon(1, None).by_tolerance
+    for rows, notes in ((governor.SHORT_HORIZON, 0), (governor.SHORT_HORIZON + 1, 1)):
+        assert len(governor._notes("paper", 0.01, 0.01, Horizon(rows, 0.01), model)) == notes
+
+
+def test_a_grid_may_fill_the_memory() -> None:
+    """One cell of four is in error: halved along the torque, 4 x 3 nodes."""
+    nodes = np.arange(3.0)
+    worst = np.zeros((2, 2, 3, 3))
+    worst[0, 0, 0] = 2.0
+    one = np.ones(1)
+    words = table_words(4, 3, 1, "float32")
+    split = grid._split(nodes, nodes, one, worst, GridBounds(1.0, 1.0, capacity_words=words))
+    assert split is not None and split[0].tolist() == [0.0, 0.5, 1.0, 2.0] and split[1].size == 3
+    assert grid._split(nodes, nodes, one, worst, GridBounds(1.0, 1.0, capacity_words=words - 1)) is None
+    ends = np.array([1.0, 2.0])
+    words = table_words(3, 3, 3, "float32")
+    for share, capacity, fits in ((2.0, words, True), (2.0, words - 1, False), (grid.VOLTAGE_SHARE, words, False)):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(grid, "_voltage_excess", lambda *_, e=share: [e])
+            found = grid._split_voltages(
+                cast(LookupTable, None), (nodes, nodes, ends), GridBounds(1.0, 1.0, capacity_words=capacity)
+            )
+        assert (found is not None) is fits
+
+
+def test_a_cell_without_a_solution_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(*arguments: Any) -> int:
+        ctypes.memset(arguments[-2], 0, 6)
+        ctypes.memset(arguments[-2] + 4, 255, 1)  # of two speeds, the third torque and the first of them
+        return 1
+
+    monkeypatch.setattr(table, "design_library", lambda: SimpleNamespace(pmsm_lookup_table=failing))
+    machine = OperatingMachine(1, 0.1, 1e-3, 1e-3, 0.1)
+    with pytest.raises(DesignInfeasible, match=r"1 of 6 cells .* first at 30 N m, 0 rad/s, 7 V"):
+        speed_table(machine, torque_nm=[10.0, 20.0, 30.0], speed_rpm=[0.0, 60.0], V_max_v=[7.0], I_max_apk=9.0)

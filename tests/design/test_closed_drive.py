@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,7 +36,7 @@ from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
-from pmsmtool.errors import ConfigError, NotAvailable
+from pmsmtool.errors import ConfigError, DesignInfeasible, NotAvailable
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.papers.closed_drive import ClosedNode, Seat, closed_drive
@@ -217,6 +218,18 @@ def test_what_is_missing_is_named() -> None:
         made(source)
     with pytest.raises(ConfigError, match="rise_s"):
         ClosedDrive("test", OFFERS, rise_s=0.0)
+
+
+def test_a_speed_without_any_torque_is_refused_with_what_the_magnet_takes() -> None:
+    source = machine()
+    rpm = 2000.0
+    with pytest.raises(DesignInfeasible, match="no torque is admissible up to 2000 rpm") as caught:
+        made(source, speed_rpm=rpm)
+    m, box = source.machine, tolerance_box(source)
+    coldest = m.psi_f_wb * (1.0 + m.alpha_psi_per_k * (box.T_magnet_c[0] - m.T_ref_c))
+    emf = coldest * (1.0 + box.factors["psi_f_wb"].half_width) * rpm * math.pi / 30.0 * m.pole_pairs
+    told = re.search(r"demand is bounded by ([\d.]+) V", str(caught.value.likely))
+    assert told and emf < float(told[1]) < 1.03 * emf  # measured 1.02 of it
 
 
 def test_a_design_of_a_closed_drive_survives_its_file() -> None:

@@ -16,14 +16,19 @@ from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
 from pmsmtool.design.design_file import Design, design_text
+from pmsmtool.design.headroom import Headroom, OperatingCells, _fluxes
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc, second_order
 from pmsmtool.design.loops.margins import (
     BLOCK,
     BLOCKS_PER_TASK,
+    JUDGED_PERCENTILE,
     Blocks,
     BlockTask,
     MarginReport,
     MarginRequest,
+    Spread,
+    _risks,
+    _with_headroom,
     evaluate,
     margin_problem,
     margin_report,
@@ -37,6 +42,7 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.parameters import Estimate
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 
@@ -172,6 +178,11 @@ def test_assumptions_and_bad_ranges_are_told() -> None:
     assert sum("assumed" in note for note in tolerance_box(source).notes) == 7
     with pytest.raises(ConfigError, match="box"):
         tolerance_box(source, U_dc_v=(300.0, 200.0))
+    assert tolerance_box(source, U_dc_v=(200.0, 200.0)).U_dc_v == (200.0, 200.0)
+    own = replace(source, estimates={"J_kgm2": Estimate(0.05, 0.0, 0.0, "kg m^2", source="vendor")})
+    notes = tolerance_box(own).notes
+    assert "J_kgm2: the drive's own value has no interval, 5 % assumed" in notes
+    assert "R_s_ohm: no standard deviation is given, 3 % assumed" in notes
 
 
 def test_what_a_data_sheet_leaves_open() -> None:
@@ -220,6 +231,35 @@ def test_headroom_is_the_physics_of_the_other_machine() -> None:
     driving = np.abs(cells.torque_nm) > 0.0
     need = np.abs(turned[driving]) * np.abs(cells.torque_nm[driving] / torque[driving])
     assert found.values["headroom_current"][0] == pytest.approx(1.0 - need.max() / 150.0, rel=1e-9)
+
+
+def test_fluxes_of_a_turned_frame_follow_all_inductances() -> None:
+    """Of constant inductances, those across the axes among them, the first order is all there is."""
+    source = load_machine_file(PROFILES / "jercic-2017.toml")
+    box, i, M = tolerance_box(source), np.array([-10.0, 20.0]), np.array([[3e-3, -4e-4], [-4e-4, 5e-3]])
+    psi_f = source.machine.psi_f_wb
+    psi = M @ i + [psi_f, 0.0]
+    one = np.ones(1)
+    cells = OperatingCells(one, one, one, *(i[:, None]), *(psi[:, None]), M.reshape(4, 1))
+    row = {name: 0.3 if name == "encoder_rad" else 1.0 for name in box.names}
+    samples = Samples(box.names, np.array([list(row.values())]))
+    i_d, i_q, psi_d, psi_q = _fluxes(source.machine, cells, psi_f * np.ones((1, 1)), samples)
+    turned = np.array([[math.cos(0.3), -math.sin(0.3)], [math.sin(0.3), math.cos(0.3)]]) @ i
+    assert [float(x[0, 0]) for x in (i_d, i_q)] == pytest.approx(turned)
+    assert [float(x[0, 0]) for x in (psi_d, psi_q)] == pytest.approx(M @ turned + [psi_f, 0.0])
+
+
+def test_what_just_holds_is_within_its_limit() -> None:
+    spread = Spread("x", "1", 0.5, 0.2, {}, "", {JUDGED_PERCENTILE: 0.2}, 0.2)
+    assert spread.ok
+    assert not replace(spread, worst=0.1).ok and not replace(spread, percentiles={JUDGED_PERCENTILE: 0.1}).ok
+    headroom = Headroom(np.array([[0.0, -0.1]]), np.array([[0.1, 0.0]]), np.zeros(1))
+    block = _with_headroom({}, headroom)
+    assert {name: beyond.tolist() for name, beyond in block.beyond.items()} == {
+        "headroom_voltage": [0.0, 1.0], "headroom_current": [0.0, 0.0],
+    }  # fmt: skip
+    problem = margin_problem(design_of())
+    assert [risk.cell for risk in _risks(problem, [block])] == [problem.cells.name(1)]
 
 
 def test_nominal_voltage_headroom_is_the_reserve_that_was_kept() -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,11 @@ def test_same_bytes_for_the_same_machine_wherever_it_lies(tmp_path: Path) -> Non
     assert str(tmp_path) not in there
 
 
+@cache
+def text_of_surface() -> str:
+    return design_text(tune(SURFACE))
+
+
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
@@ -107,10 +113,11 @@ def test_same_bytes_for_the_same_machine_wherever_it_lies(tmp_path: Path) -> Non
         (('loop = "current_d"', 'loop = "current_x"'), "loop"),
         (("[machine_file]", "[machine_fil]"), "machine_file"),
         (("[request]", "[request"), "TOML"),
+        (("voltage_margin = 0.08", "voltage_margin = 0.8"), "outside 0..0.5"),
     ],
 )
 def test_a_damaged_design_is_refused(edit: tuple[str, str], message: str) -> None:
-    text = design_text(tune(SURFACE))
+    text = text_of_surface()
     assert edit[0] in text
     with pytest.raises(ConfigError) as caught:
         parse_design(text.replace(*edit))

@@ -281,8 +281,6 @@ class _Problem:
         n_wanted = self.rated.n_max_rpm if self.request.n_max_rpm is None else self.request.n_max_rpm
         sags = self.request.axis == "speed" and len(self.U_dc) == 1  # the drive looks up at n U_dc / U_now
         n_max = largest_speed_rpm(self._reachable, n_wanted / SAG_SHARE if sags else n_wanted)
-        if not n_max > 0.0:
-            raise DesignInfeasible("no operating point at any speed", where="look-up table", hint="check U_dc and R_s")
         notes = () if n_max >= n_wanted else (_unreachable(n_max, n_wanted),)
         points = FIRST_SPEEDS if self.request.y_points is None else self.request.y_points
         if self.request.axis == "speed":

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import struct
 import zlib
 from collections.abc import Mapping
@@ -155,7 +156,7 @@ def table_parameters(arrays: Mapping[str, NDArray[Any]], where: str) -> Paramete
     except (KeyError, TypeError, ValueError, RecursionError, OverflowError) as error:
         raise ConfigError(f"is no look-up table: {error}", where=where, hint=hint) from None
     parts = (x, y, z, i_d, i_q)
-    cells = parts[0].size * parts[1].size * parts[2].size
+    cells = math.prod(axis.size for axis in (x, y, z))
     if facts.get("schema") != SCHEMA or kind not in _KINDS or stored not in _FORMATS or {i_d.size, i_q.size} != {cells}:
         raise ConfigError("is no look-up table as a drive stores it", where=where, hint=hint)
     if zlib.crc32(_words(stored, parts)) != facts.get("words_crc32"):

@@ -203,7 +203,7 @@ def refined_table(
     x, y, z = stored_axes(*(np.asarray(axis, dtype=np.float64) for axis in (torque_nm, y, U_dc_v)))
     axes: Axes = (x, y, z)
     search = POINTS_PER_INTERVAL if z.size < 2 else SEARCH_POINTS
-    for turn in range(_TURNS_MAX):
+    for _ in range(_TURNS_MAX):
         table = as_stored(solve(*axes), bounds.stored)
         for points in dict.fromkeys((search, POINTS_PER_INTERVAL)):
             worst = cell_errors(table, points)
@@ -212,15 +212,14 @@ def refined_table(
                 break
         else:
             return table, error
-        finer = None
-        if turn < _TURNS_MAX - 1:
-            finer = _split_voltages(table, axes, bounds) or _split(*axes, worst, bounds)
+        finer = _split_voltages(table, axes, bounds) or _split(*axes, worst, bounds)
         if finer is None:
             break
         axes = finer
     error = interpolation_error(table)
+    nodes = " x ".join(str(axis.size) for axis in (table.torque_nm, table.y, table.U_dc_v))
     raise DesignInfeasible(
-        f"{' x '.join(str(axis.size) for axis in axes)} nodes keep the torque within {error.torque_nm:.3g} N m and the "
+        f"{nodes} nodes keep the torque within {error.torque_nm:.3g} N m and the "
         f"voltage within {error.voltage_v:.3g} V; asked for: {bounds.torque_nm:.3g} N m, {bounds.voltage_v:.3g} V",
         where=f"look-up table ({bounds.stored}, {bounds.capacity_words} words)",
         likely="the drive's memory for tables is full",

@@ -81,14 +81,12 @@ class CurrentChoice:
 
     def meets_request(self) -> bool:
         """Whether every loop has the margins asked for."""
-        gain = 10.0 ** (self.request.gain_margin_db / 20.0)
+        phase_deg, gain_db = self.request.phase_margin_deg, self.request.gain_margin_db
         try:
             loops = self.loops().values()
         except DesignInfeasible:
             return False
-        return all(
-            m.stable and m.phase_margin_deg >= self.request.phase_margin_deg and m.gain_margin >= gain for m in loops
-        )
+        return all(m.stable and m.phase_margin_deg >= phase_deg and m.gain_margin_db >= gain_db for m in loops)
 
 
 def choose_current(source: MachineFile, request: TuneRequest, I_max_apk: float) -> CurrentChoice:

@@ -159,8 +159,7 @@ def _gain_crossings(loop: SampledLoop) -> Array:
     found = _polished(guesses, lambda omega: np.abs(loop.at(omega)) - 1.0, loop)
     omega = _SLOW / loop.T_s
     over = np.abs(loop.at(omega)) - 1.0
-    at = np.flatnonzero(np.sign(over[1:]) * np.sign(over[:-1]) < 0.0)
-    missed = at[[not np.any((found >= omega[k]) & (found <= omega[k + 1])) for k in at]] if at.size else at
+    missed = np.flatnonzero(np.diff(np.signbit(over)) & (np.histogram(found, omega)[0] == 0))
     share = over[missed] / (over[missed] - over[missed + 1])
     return np.sort(np.concatenate([found, omega[missed] + share * (omega[missed + 1] - omega[missed])]))
 
@@ -193,7 +192,7 @@ def _polished(theta: Array, function: Callable[[Array], Array], loop: SampledLoo
     edges = np.concatenate(([theta[0] * 0.5], 0.5 * (theta[1:] + theta[:-1]), [0.5 * (theta[-1] + math.pi)]))
     low, high = edges[:-1] / loop.T_s, edges[1:] / loop.T_s
     f_low, f_high = function(low), function(high)
-    crossing = np.sign(f_low) * np.sign(f_high) < 0.0
+    crossing = np.signbit(f_low) != np.signbit(f_high)
     low, high, f_low, f_high = low[crossing], high[crossing], f_low[crossing], f_high[crossing]
     for _ in range(_POLISH_STEPS):
         middle = low + (high - low) * f_low / (f_low - f_high)

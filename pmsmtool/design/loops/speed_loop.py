@@ -26,9 +26,6 @@ from pmsmtool.machine.two_masses import Mechanics, sampled
 System = tuple[Array, Array, Array, float]
 """A, b, c, d of a single-input single-output system, x(k+1) = A x + b u, y = c x + d u."""
 
-PLL_DAMPING = 1.0
-"""Damping of the drive's speed estimate, a double pole at ``encoder.pll_bandwidth_rad_s``."""
-
 
 class SpeedMethod(StrEnum):
     """Rule that gives the speed gains."""
@@ -107,7 +104,7 @@ class SpeedPath:
 
 def small_time_constants(path: SpeedPath, alpha_current: float) -> float:
     """Return T_sum (s): current loop 1/alpha and delay, speed estimate, filter, half the controller's hold."""
-    estimate = 2.0 * PLL_DAMPING / path.pll_rad_s
+    estimate = 2.0 / path.pll_rad_s  # a double pole
     feedback = 1.0 / (2.0 * math.pi * path.filter_hz)
     return 1.0 / alpha_current + path.current.delay_s + estimate + feedback + 0.5 * path.T_speed
 

@@ -97,7 +97,7 @@ def _gain_margins(loop: Response, grid: Array, values: Complex) -> Array:
     at = np.abs(loop(found[:, None])[:, 0])
     last = values[:, -1].real
     with np.errstate(divide="ignore"):
-        end = np.where(last < 0.0, -20.0 * np.log10(np.abs(last)), np.inf)
+        end = -20.0 * np.log10(-np.minimum(last, 0.0))
         return np.asarray(np.where(some, np.minimum(-20.0 * np.log10(at), end), end), dtype=np.float64)
 
 
