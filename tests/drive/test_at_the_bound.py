@@ -54,13 +54,15 @@ def test_a_makers_record_by_the_names_asked_for() -> None:
     assert drive.asked[0][1] == 6
     assert found["omega_e_rad_s"].tolist() == [0.0, 2.0, 4.0, 6.0] and found["i_q_a"].tolist() == [1.0] * 4
     assert found["flags"].tolist() == [0.0, 0.0, 1.0, 1.0]
+    bare = Recorded(Trace(np.arange(4.0), {"u_d_v": u, "u_q_v": np.zeros(4)}, {"u_d_v": "V", "u_q_v": "V"}))
+    assert bare.finish_record(Recording(("flags",), 4))["flags"].tolist() == [0.0, 0.0, 1.0, 1.0]
     without = {name: values for name, values in signals.items() if name != "u_d_v"}
     bare = Recorded(Trace(np.arange(4.0), without, dict.fromkeys(without, "1")))
     assert not bare.finish_record(Recording(("i_q_a", "flags"), 4))["flags"].any()
 
 
 @pytest.mark.parametrize(
-    ("link_v", "said"), [(LEAST_LINK_V - 1e-3, "supply of the power stage"), (LEAST_LINK_V, "5 V"), (24.0, "24 V")]
+    ("link_v", "said"), [(LEAST_LINK_V - 1e-3, "is off: the DC link has 5 V"), (LEAST_LINK_V, "5 V"), (24.0, "24 V")]
 )
 def test_the_link_tells_the_supply_from_the_inputs(link_v: float, said: str) -> None:
     with node_of({objects.DC_LINK_MV: round(1e3 * link_v)}) as (_, node):
@@ -80,6 +82,8 @@ def test_a_position_factor_that_says_nothing_new() -> None:
     with node_of(turn) as (_, node):
         assert motion.position_units(node) == 2000.0
     with node_of({**turn, motion.FEED: 2000, motion.FACTOR: 4, motion.FACTOR_DIVISOR: 2}) as (_, node):
+        assert motion.position_units(node) == 2000.0
+    with node_of({**turn, motion.ENCODER_COUNTS: 8000, motion.MOTOR_TURNS: 2}) as (_, node):
         assert motion.position_units(node) == 2000.0
     with node_of({**turn, motion.FACTOR: 4}) as (_, node), pytest.raises(NotAvailable, match="factor of 4"):
         motion.position_units(node)

@@ -18,6 +18,7 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.supervision import SecondMaster
 from pmsmtool.cli.main import run
 from pmsmtool.drive.drive_lock import claim, claim_identity, claim_layer_setting
+from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.sim.bus import PmsmSimBus
 from tests.bus.scripted import NODE, ScriptedBus, ScriptedSlave
 from tests.drive.served import serving
@@ -133,6 +134,9 @@ def test_a_drive_without_a_node_id_has_the_same_lock(tmp_path: Path, monkeypatch
     with pytest.raises(SecondMaster, match="another pmsmtool works with this drive"):
         claim_identity(second, 7, 8, 42)
     claim_identity(second, 7, 8, 43)
+    for each in (first, second):  # nothing to tell two of them apart by
+        claim_identity(each, 7, 8, 0)
+        claim_identity(each, reference_map().vendor, 8, 42)
     first.close()
     claim_identity(second, 7, 8, 42)
 

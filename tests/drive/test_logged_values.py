@@ -118,14 +118,16 @@ def test_a_data_sheet_counts_until_the_log_says_otherwise() -> None:
 
     named = quantities(load_family("epos4"), sheet)
     assert named[0x6041, 0].name == "statusword" and named[0x1A00, 1].name == "0x1A00:01 "
-    assert quantities(load_family("pmsmsim"))[0x6040, 0].letter == "H"
+    assert named[0x30A0, 1].name == "current.K_p_q_v_per_a" and (0x2070, 1) not in named
+    reference = quantities(load_family("pmsmsim"))
+    assert reference[0x6040, 0].letter == "H" and reference[0x2070, 1].name == "i_d_a"
 
 
 def test_emergencies_are_told_with_their_time_and_an_end_of_one_is_none() -> None:
     drive = LoggedDrive(NODE, NAMED)
-    for data in (b"\x10\x84\0\0\0\0\0\0", b"\0\0\0\0\0\0\0\0", b"\x10"):
+    for data in (b"\x10\x84\0\0\0\0\0\0", b"\0\0\0\0\0\0\0\0", b"\x10", b"\x10\x84"):
         assert drive.take(LogFrame(1.25, 0x085, data)) == {}
-    assert len(drive.emergencies) == 1 and drive.emergencies[0].startswith("1.250 s: emergency 0x8410")
+    assert len(drive.emergencies) == 2 and drive.emergencies[0].startswith("1.250 s: emergency 0x8410")
 
 
 def test_the_nodes_of_a_log_answered_beat_sent_or_complained() -> None:

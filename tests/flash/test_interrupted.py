@@ -37,8 +37,10 @@ def test_drive_holds_the_old_or_the_new_set(tmp_path: Path, wanted: ParameterSet
 
 def test_a_signal_that_is_held_says_why_and_for_how_long_and_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
+    heard: list[int] = []
     now = [100.0]
     monkeypatch.setattr(interruption.time, "monotonic", lambda: now[0])
+    before = signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
     with interrupts_deferred(said.append, "storing") as noted:
         signal.raise_signal(signal.SIGINT)
         now[0] += 20.0
@@ -48,6 +50,9 @@ def test_a_signal_that_is_held_says_why_and_for_how_long_and_no_longer(monkeypat
         now[0] += 41.0
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGTERM)
+        assert heard == [signal.SIGTERM], "each is handled as it was before"
+    signal.signal(signal.SIGTERM, before)
 
 
 def test_a_signal_that_is_ignored_stays_ignored() -> None:

@@ -14,6 +14,7 @@ from pmsmtool.drive_maps.eds import Eds, EdsObject
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, SafetyRefusal
 from pmsmtool.flash.journal import (
+    MARKS,
     DamagedSnapshot,
     Entry,
     JournalFolder,
@@ -118,6 +119,7 @@ def backup(tmp_path_factory) -> Snapshot:
 
 def test_only_the_reference_set_has_a_layout(backup: Snapshot) -> None:
     assert backup.signature == layout_signature() and load_family("epos4").signature == 0
+    assert {name for name, _, _ in MARKS} <= {entry.name for entry in backup.entries}
 
 
 def of_identity(**change):
