@@ -74,7 +74,7 @@ static problem state_problem(const pmsm_period *period, pmsm_real tau)
         {{1, 0, 0, 1, 0, 0, I_m}, voltage},
         (rotation > IGNORED_SHARE * voltage.V) ? 2u : 1u,
         (pmsm_real)p->field_weakening_i_d_min_a,
-        (i_d_lm > PMSM_C(0.0)) ? i_d_lm : PMSM_C(0.0),
+        pmsm_max(i_d_lm, PMSM_C(0.0)),
         (pmsm_real)p->field_weakening_h1,
         (pmsm_real)p->field_weakening_h2,
         i_d_lm,
@@ -118,8 +118,7 @@ static uint32_t cut_interval(const pmsm_row *row, pmsm_real d, pmsm_real *low, p
 static pmsm_dq project_on_bound(problem *q, pmsm_real d, pmsm_real i_q)
 {
     const pmsm_real I_m = q->row[0].V;
-    const pmsm_real rest = I_m * I_m - d * d;
-    const pmsm_real reach = (rest > PMSM_C(0.0)) ? PMSM_SQRT(rest) : PMSM_C(0.0);
+    const pmsm_real reach = PMSM_SQRT(pmsm_max(I_m * I_m - d * d, PMSM_C(0.0)));
     pmsm_real low = -reach;
     pmsm_real high = reach;
     if (q->rows > 1u && cut_interval(&q->row[1], d, &low, &high) == 0u) {
@@ -157,7 +156,7 @@ static pmsm_dq nearest(problem *q, pmsm_dq y)
 {
     const pmsm_row *circle = &q->row[0];
     const pmsm_row *ellipse = &q->row[1];
-    const pmsm_dq x = (pmsm_square(y) <= circle->V * circle->V) ? y : on_circle(y, circle->V);
+    const pmsm_dq x = (pmsm_is_within(y, circle->V) != 0u) ? y : on_circle(y, circle->V);
     if (q->rows < 2u || is_within(ellipse, x) != 0u) {
         q->empty = 0u;
         return x;

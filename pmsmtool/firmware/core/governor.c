@@ -177,7 +177,7 @@ static void meet_both(const pmsm_row *row, const pmsm_row *circle, pmsm_dq r, pm
         const pmsm_real share = circle->V / PMSM_SQRT(square);
         outside.d = share * r.d;
         outside.q = share * r.q;
-        if (pmsm_square(pmsm_voltage_of(row, outside)) <= row->V * row->V) {
+        if (pmsm_is_within(pmsm_voltage_of(row, outside), row->V) != 0u) {
             *v = outside;
             return;
         }
@@ -205,7 +205,7 @@ static pmsm_dq pre_project(pmsm_period *period, pmsm_governor_rows *rows, pmsm_d
     pmsm_dq v = pmsm_project_row(&pre, r, steps);
     state->reachable_age = 0u;
     rows->reachable = 1u;
-    if (rows->count <= rows->steady + 1u || pmsm_square(v) <= last->V * last->V) {
+    if (rows->count <= rows->steady + 1u || pmsm_is_within(v, last->V) != 0u) {
         return v;
     }
     if (fresh != 0u && state->time_to_go <= PMSM_C(0.0)) {

@@ -159,18 +159,13 @@ void pmsm_governor_build(pmsm_period *period, pmsm_governor_rows *rows)
     }
 }
 
-static uint32_t row_admits(const pmsm_row *row, pmsm_dq r)
-{
-    return (pmsm_square(pmsm_voltage_of(row, r)) <= row->V * row->V) ? 1u : 0u;
-}
-
 uint32_t pmsm_governor_admits(const pmsm_period *period, const pmsm_governor_rows *rows, pmsm_dq r)
 {
-    if (row_admits(&rows->row[0], r) == 0u) {
+    if (pmsm_is_within(pmsm_voltage_of(&rows->row[0], r), rows->row[0].V) == 0u) {
         return 0u;
     }
     for (uint32_t k = rows->steady; k < rows->count; k++) {
-        if (row_admits(&rows->row[k], r) == 0u) {
+        if (pmsm_is_within(pmsm_voltage_of(&rows->row[k], r), rows->row[k].V) == 0u) {
             return 0u;
         }
     }

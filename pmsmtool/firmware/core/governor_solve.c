@@ -92,7 +92,7 @@ static pmsm_real row_share(const pmsm_row *row, pmsm_dq p, pmsm_dq way, pmsm_rea
     if (cc > slack * limit) {
         return PMSM_C(-1.0); /* p itself is outside */
     }
-    cc = (cc > PMSM_C(0.0)) ? PMSM_C(0.0) : cc;
+    cc = pmsm_min(PMSM_C(0.0), cc);
     const pmsm_real root = PMSM_SQRT(bb * bb - aa * cc);
     if (bb > PMSM_C(0.0)) {
         return -cc / (bb + root);

@@ -79,7 +79,7 @@ uint32_t pmsm_project_half_planes(const pmsm_dq *a, const pmsm_real *b, uint32_t
         for (uint32_t j = 1u; j < count; j++) {
             const pmsm_real g = beyond(&h, j, x);
             k = (g > worst) ? j : k;
-            worst = (g > worst) ? g : worst;
+            worst = pmsm_max(g, worst);
         }
         const uint32_t again = (k == h.basis[0] || k == h.basis[1]) ? 1u : 0u;
         if (worst <= PMSM_PROJECTION_VIOLATION || (again != 0u && worst <= PMSM_PROJECTION_STALL)) {

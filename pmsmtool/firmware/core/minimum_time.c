@@ -119,7 +119,7 @@ static uint32_t keep_current(const pmsm_period *period, pmsm_dq offset, pmsm_dq 
     const pmsm_real limit = (pmsm_real)params->governor_I_transient_apk;
     const pmsm_real most = limit * limit;
     const pmsm_real now = pmsm_square(i);
-    const pmsm_real square = (now <= FORCED * most) ? ((SHRINK * now > most) ? SHRINK * now : most) : now;
+    const pmsm_real square = (now <= FORCED * most) ? pmsm_max(SHRINK * now, most) : now;
     pmsm_dq step = {per_d * w->d, per_q * w->q};
     const pmsm_dq next = {free.d + step.d, free.q + step.q};
     if (pmsm_square(next) <= square) {
@@ -181,7 +181,7 @@ enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, p
     pmsm_real T = state->time_to_go - T_s;
     const pmsm_dq way = {t.b.d - t.a.d, t.b.q - t.a.q};
     const pmsm_real near = NEAR_SHARE * t.V * T_s;
-    if (pmsm_square(way) <= near * near) {
+    if (pmsm_is_within(way, near) != 0u) {
         state->time_to_go = PMSM_C(0.0);
         return PMSM_TRANSFER_NONE;
     }
@@ -191,7 +191,7 @@ enum pmsm_transfer pmsm_minimum_time(pmsm_period *period, const pmsm_row *row, p
         found = find_time(&t, least, &T, &m, steps);
     } else if (may_start != 0u && is_cornered(period, offset) == 0u) {
         T = DIRECT_SHARE * PMSM_SQRT(pmsm_square(way)) / t.V;
-        T = (T > least) ? T : least;
+        T = pmsm_max(T, least);
         found = find_time(&t, least, &T, &m, steps);
     }
     state->time_to_go = (found == PMSM_TRANSFER_SOUGHT) ? T : PMSM_C(0.0);

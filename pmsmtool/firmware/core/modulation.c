@@ -29,7 +29,7 @@ pmsm_real pmsm_voltage_radius(const pmsm_period *period, pmsm_dq u)
     const pmsm_real ab = pmsm_abs(legs.a - legs.b);
     const pmsm_real bc = pmsm_abs(legs.b - legs.c);
     const pmsm_real ca = pmsm_abs(legs.c - legs.a);
-    const pmsm_real most = (ab > bc) ? ((ab > ca) ? ab : ca) : ((bc > ca) ? bc : ca);
+    const pmsm_real most = pmsm_max(pmsm_max(ab, bc), ca);
     const pmsm_real line = period->state->derived.duty_most * period->U_dc;
     return (most > PMSM_C(0.0)) ? line * PMSM_SQRT(pmsm_square(u)) / most : period->V_max;
 }
@@ -73,8 +73,8 @@ static pmsm_real duty(pmsm_real d, pmsm_real most, uint32_t *clipped)
 static uint32_t set_duties(const pmsm_derived *derived, pmsm_abc u, pmsm_real U_dc, uint32_t beyond,
                            pmsm_output *output)
 {
-    const pmsm_real high = (u.a > u.b) ? ((u.a > u.c) ? u.a : u.c) : ((u.b > u.c) ? u.b : u.c);
-    const pmsm_real low = (u.a < u.b) ? ((u.a < u.c) ? u.a : u.c) : ((u.b < u.c) ? u.b : u.c);
+    const pmsm_real high = pmsm_max(pmsm_max(u.a, u.b), u.c);
+    const pmsm_real low = pmsm_min(pmsm_min(u.a, u.b), u.c);
     const pmsm_real middle = PMSM_C(0.5) * (high + low);
     const pmsm_real inverse = (U_dc > PMSM_C(0.0)) ? PMSM_C(1.0) / U_dc : PMSM_C(0.0);
     const pmsm_real centre = PMSM_C(0.5) * derived->duty_most;

@@ -58,7 +58,7 @@ void pmsm_prepare_duties(pmsm_derived *derived, const pmsm_params *params)
 /* What demands on one side of an edge's middle contribute along the edge, times y, and what stays of the side's end. */
 static pmsm_real along(pmsm_real side, pmsm_real y, pmsm_real *end)
 {
-    const pmsm_real sine = (side * y < PMSM_C(0.5)) ? side * y : PMSM_C(0.5); /* the corner */
+    const pmsm_real sine = pmsm_min(side * y, PMSM_C(0.5)); /* the corner */
     const pmsm_real cosine = PMSM_SQRT(PMSM_C(1.0) - sine * sine);
     *end = side * (cosine - COS_30);
     return PMSM_C(0.5) * (pmsm_arctan(sine, cosine) - sine * cosine);
@@ -67,7 +67,7 @@ static pmsm_real along(pmsm_real side, pmsm_real y, pmsm_real *end)
 /* One step of Newton's method towards the y whose fundamental, over the linear limit, is asked for. */
 static pmsm_real improved(const pmsm_derived *derived, pmsm_real y, pmsm_real fundamental)
 {
-    const pmsm_real cosine = (y > COS_30) ? y : COS_30; /* of half of what lies beyond the edge */
+    const pmsm_real cosine = pmsm_max(y, COS_30); /* of half of what lies beyond the edge */
     const pmsm_real sine = PMSM_SQRT(PMSM_C(1.0) - cosine * cosine);
     const pmsm_real angle = pmsm_arctan(sine, cosine);
     pmsm_real end_low;
@@ -94,8 +94,8 @@ pmsm_dq pmsm_lengthen(const pmsm_period *period, pmsm_dq u, uint32_t *beyond)
     const pmsm_real excess = fundamental - PMSM_C(1.0);
     const pmsm_real left = derived->over_most - fundamental;
     const pmsm_real corner = PMSM_C(1.0) - excess * (CORNER_FIRST + CORNER_SECOND * excess);
-    const pmsm_real far = (left > PMSM_C(0.0)) ? PMSM_SQRT(derived->over_rate * left) : PMSM_C(0.0);
-    pmsm_real ratio = pmsm_clamp((corner < far) ? corner : far, RATIO_LEAST, PMSM_C(1.0));
+    const pmsm_real far = PMSM_SQRT(derived->over_rate * pmsm_max(left, PMSM_C(0.0)));
+    pmsm_real ratio = pmsm_clamp(pmsm_min(corner, far), RATIO_LEAST, PMSM_C(1.0));
     ratio = pmsm_clamp(improved(derived, ratio, fundamental), RATIO_LEAST, PMSM_C(1.0));
     const pmsm_real scale = PMSM_C(1.0) / (ratio * fundamental);
     const pmsm_dq longer = {u.d * scale, u.q * scale};
@@ -132,8 +132,7 @@ uint32_t pmsm_make_readable(const pmsm_derived *derived, uint32_t beyond, pmsm_a
     *second.made -= shift;
     *high.made -= shift;
     const pmsm_real apart = (beyond != 0u) ? derived->duties_apart : PMSM_C(0.0);
-    const pmsm_real below = *high.made - apart;
-    const pmsm_real most = (below < derived->second_duty_most) ? below : derived->second_duty_most;
+    const pmsm_real most = pmsm_min(*high.made - apart, derived->second_duty_most);
     const pmsm_real possible = pmsm_clamp(*second.made, *low.made + apart, most);
     const uint32_t clipped = (possible != *second.made) ? 1u : 0u;
     *second.made = possible;

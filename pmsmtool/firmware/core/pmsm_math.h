@@ -17,14 +17,6 @@
 #endif
 #endif
 
-#ifndef PMSM_ABS /* one instruction; a comparison and a branch otherwise */
-#ifdef PMSM_REAL_DOUBLE
-#define PMSM_ABS(x) __builtin_fabs(x)
-#else
-#define PMSM_ABS(x) __builtin_fabsf(x)
-#endif
-#endif
-
 #define PMSM_PI PMSM_C(3.14159265358979323846)
 #define PMSM_SQRT3 PMSM_C(1.73205080756887729353)
 #define PMSM_RPM (PMSM_C(30.0) / PMSM_PI) /* rpm per rad/s */
@@ -40,6 +32,16 @@
 #define PMSM_PIO2_B 0.000239670276641845703125F
 #define PMSM_PIO2_C 1.5893254773528196692e-8F
 #endif
+
+static inline pmsm_real pmsm_min(pmsm_real x, pmsm_real y)
+{
+    return (x < y) ? x : y;
+}
+
+static inline pmsm_real pmsm_max(pmsm_real x, pmsm_real y)
+{
+    return (x > y) ? x : y;
+}
 
 static inline int32_t pmsm_nearest(pmsm_real x)
 {
@@ -84,11 +86,11 @@ static inline pmsm_real pmsm_arctan(pmsm_real y, pmsm_real x)
 {
     const pmsm_real size_x = (x < PMSM_C(0.0)) ? -x : x;
     const pmsm_real size_y = (y < PMSM_C(0.0)) ? -y : y;
-    const pmsm_real large = (size_x > size_y) ? size_x : size_y;
+    const pmsm_real large = pmsm_max(size_x, size_y);
     if (large <= PMSM_C(0.0)) {
         return PMSM_C(0.0);
     }
-    pmsm_real t = ((size_x > size_y) ? size_y : size_x) / large;
+    pmsm_real t = pmsm_min(size_y, size_x) / large;
 #ifdef PMSM_REAL_DOUBLE /* two half-angle steps bring t below tan(pi/16); the series ends below 1e-17 */
     t = t / (1.0 + PMSM_SQRT(1.0 + t * t));
     t = t / (1.0 + PMSM_SQRT(1.0 + t * t));
@@ -126,7 +128,11 @@ static inline pmsm_real pmsm_wrap(pmsm_real x)
 
 static inline pmsm_real pmsm_abs(pmsm_real x)
 {
-    return PMSM_ABS(x);
+#ifdef PMSM_REAL_DOUBLE /* one instruction; a comparison and a branch otherwise */
+    return __builtin_fabs(x);
+#else
+    return __builtin_fabsf(x);
+#endif
 }
 
 static inline pmsm_real pmsm_clamp(pmsm_real x, pmsm_real low, pmsm_real high)
@@ -137,6 +143,11 @@ static inline pmsm_real pmsm_clamp(pmsm_real x, pmsm_real low, pmsm_real high)
 static inline pmsm_real pmsm_square(pmsm_dq x)
 {
     return x.d * x.d + x.q * x.q;
+}
+
+static inline uint32_t pmsm_is_within(pmsm_dq x, pmsm_real radius)
+{
+    return (pmsm_square(x) <= radius * radius) ? 1u : 0u;
 }
 
 /* Stator frame -> frame at the angle of (sine, cosine). */

@@ -25,14 +25,14 @@ static cdm_gains cdm(pmsm_real gamma, pmsm_real tau, pmsm_real L, pmsm_real R)
 {
     const pmsm_real a1 = gamma / tau;
     const pmsm_real K_p = a1 * L - R;
-    const cdm_gains gains = {(K_p > PMSM_C(0.0)) ? K_p : PMSM_C(0.0), a1 / tau * L};
+    const cdm_gains gains = {pmsm_max(K_p, PMSM_C(0.0)), a1 / tau * L};
     return gains;
 }
 
 /* (15); printed without omega_e on K_e, kept as an ablation. At standstill there is no rotation voltage to follow. */
 static pmsm_real decoupling_phase(const pmsm_period *period, const polar_plant *p, pmsm_dq i)
 {
-    if (p->omega <= PMSM_C(0.0) && p->omega >= PMSM_C(0.0)) {
+    if (pmsm_abs(p->omega) <= PMSM_C(0.0)) {
         return PMSM_C(0.0);
     }
     if (period->params->polar_mode == PMSM_POLAR_LINEAR_PRINTED) {
@@ -43,15 +43,12 @@ static pmsm_real decoupling_phase(const pmsm_period *period, const polar_plant *
 
 static pmsm_real away_from_zero(pmsm_real V_a, pmsm_real smallest)
 {
-    if (V_a < PMSM_C(0.0)) {
-        return (V_a > -smallest) ? -smallest : V_a;
-    }
-    return (V_a < smallest) ? smallest : V_a;
+    return (V_a < PMSM_C(0.0)) ? pmsm_min(-smallest, V_a) : pmsm_max(smallest, V_a);
 }
 
 static uint32_t may_integrate(const pmsm_period *period, pmsm_real x, pmsm_real limit)
 {
-    const uint32_t inside = (x <= limit && x >= -limit) ? 1u : 0u;
+    const uint32_t inside = (pmsm_abs(x) <= limit) ? 1u : 0u;
     return inside | (((period->params->polar_options & PMSM_POLAR_NO_ANTI_WINDUP) != 0u) ? 1u : 0u);
 }
 
@@ -229,10 +226,10 @@ static uint32_t use_linear_law(pmsm_period *period, const polar_plant *p)
     const axis_gains gains = regularised_gains(period);
     const pmsm_dq base = regularised_base(period, &gains);
     pmsm_observe_disturbance(period, pmsm_filter_weight((pmsm_real)period->params->polar_omega_dob_rad_s * p->T_s));
-    const uint32_t fits = (pmsm_square(holding_voltage(period, period->reference)) <= p->V * p->V) ? 1u : 0u;
+    const uint32_t fits = pmsm_is_within(holding_voltage(period, period->reference), p->V);
     if (memory->linear != 0u) {
         const pmsm_dq v = {base.d + memory->integrator.d, base.q + memory->integrator.q};
-        if (fits != 0u || pmsm_square(v) <= p->V * p->V) {
+        if ((fits | pmsm_is_within(v, p->V)) != 0u) {
             return 1u;
         }
         pmsm_polar_phase_start(period, p, holding_voltage(period, period->i_model));

@@ -52,7 +52,7 @@ static pmsm_real within_reach(const polar_plant *p, pmsm_real i_q)
 static polar_plant schedule_plant(const polar_plant *plant)
 {
     polar_plant p = *plant;
-    p.omega = (p.omega > p.alpha) ? p.omega : p.alpha;
+    p.omega = pmsm_max(p.omega, p.alpha);
     return p;
 }
 
@@ -60,7 +60,7 @@ static polar_plant schedule_plant(const polar_plant *plant)
 static pid place(const polar_plant *p, pmsm_real sigma, pmsm_real n1, pmsm_real n0)
 {
     const pmsm_real w0 = p->alpha * p->alpha + p->omega * p->omega;
-    const pmsm_real m = (w0 > sigma * sigma) ? w0 : sigma * sigma;
+    const pmsm_real m = pmsm_max(w0, sigma * sigma);
     const pmsm_real c3 = PMSM_C(4.0) * sigma - PMSM_C(2.0) * p->alpha;
     const pmsm_real c2 = PMSM_C(4.0) * sigma * sigma + PMSM_C(2.0) * m - w0 - PMSM_C(2.0) * p->alpha * c3;
     const pmsm_real b0 = m * m / n0;
@@ -156,9 +156,8 @@ void pmsm_polar_phase_start(pmsm_period *period, const polar_plant *plant, pmsm_
 {
     pmsm_polar_state *memory = &period->state->polar;
     const pmsm_real mirror = (period->omega_e < PMSM_C(0.0)) ? PMSM_C(-1.0) : PMSM_C(1.0);
-    const pmsm_real size = PMSM_SQRT(pmsm_square(v));
     memory->delta = pmsm_arctan(-v.d, mirror * v.q);
-    memory->amplitude = (size < plant->V) ? size : plant->V;
+    memory->amplitude = pmsm_min(PMSM_SQRT(pmsm_square(v)), plant->V);
     memory->phase_pid.integral = memory->delta;
     memory->amplitude_pid.integral = memory->amplitude;
     memory->phase_pid.low = mirror * (set_point_share(period) * period->reference.q - period->i.q);
@@ -177,8 +176,7 @@ void pmsm_polar_phase(pmsm_period *period, const polar_plant *plant)
     pmsm_real V_a = plant->V;
     pmsm_real V_schedule = plant->V;
     if (period->params->polar_mode == PMSM_POLAR_PROPOSED) {
-        const pmsm_real floor_V = SMALLEST_SHARE * plant->V;
-        V_schedule = (memory->amplitude > floor_V) ? memory->amplitude : floor_V;
+        V_schedule = pmsm_max(memory->amplitude, SMALLEST_SHARE * plant->V);
         V_a = amplitude_step(period, &scheduled, i, target, V_schedule);
     }
     const pmsm_real delta = phase_step(period, &scheduled, i, target, V_schedule);

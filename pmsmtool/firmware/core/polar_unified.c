@@ -111,7 +111,7 @@ static pmsm_dq hold_torque(const pmsm_period *period, const circle *c, pmsm_real
 static pmsm_dq limit_current(pmsm_period *period, const circle *c, pmsm_dq i)
 {
     const pmsm_real I = pmsm_current_limit(period);
-    if (pmsm_square(i) <= I * I) {
+    if (pmsm_is_within(i, I) != 0u) {
         return i;
     }
     pmsm_real slope;
@@ -133,7 +133,7 @@ static operating_point find_point(pmsm_period *period, pmsm_real V)
 {
     const pmsm_dq wanted = period->reference;
     operating_point point = {wanted, steady_voltage(period, wanted), 0u};
-    if (pmsm_square(point.v) <= V * V) {
+    if (pmsm_is_within(point.v, V) != 0u) {
         return point;
     }
     const circle c = voltage_circle(period, V);
@@ -156,7 +156,7 @@ void pmsm_polar_unified(pmsm_period *period, const polar_plant *p)
     memory->weight = pmsm_filter_weight((pmsm_real)params->polar_omega_dob_rad_s * p->T_s);
     pmsm_observe_disturbance(period, memory->weight);
     const pmsm_real V_ref = (pmsm_real)params->polar_V_ref_ratio * period->V_max;
-    const operating_point o = find_point(period, (V_ref < p->V) ? V_ref : p->V);
+    const operating_point o = find_point(period, pmsm_min(V_ref, p->V));
     const pmsm_real L_d = (pmsm_real)params->motor_L_d_h;
     const pmsm_real L_q = (pmsm_real)params->motor_L_q_h;
     const pmsm_dq e = {o.i.d - period->i_model.d, o.i.q - period->i_model.q};

@@ -113,7 +113,7 @@ pmsm_dq pmsm_project_row_from(const pmsm_row *row, pmsm_dq r, pmsm_real *multipl
         }
         const pmsm_dq z = solve(&S, times(K, w));
         lambda += (size - row->V) * square / (row->V * pmsm_dot(w, z));
-        lambda = (lambda > PMSM_C(0.0)) ? lambda : PMSM_C(0.0);
+        lambda = pmsm_max(lambda, PMSM_C(0.0));
         least = PMSM_C(0.0);
         S = shifted_identity(K, lambda);
         w = solve(&S, a);
@@ -208,7 +208,7 @@ uint32_t pmsm_project_pair(const pmsm_row *first, const pmsm_row *second, pmsm_d
     }
     const pmsm_dq a = pmsm_voltage_of(first, outside);
     const pmsm_dq b = pmsm_voltage_of(first, best);
-    const pmsm_real within = (depth > PMSM_C(0.0)) ? depth : PMSM_C(0.0);
+    const pmsm_real within = pmsm_max(depth, PMSM_C(0.0));
     const pmsm_real share = PMSM_SQRT(within / (within + excess(second, inverse, outside)));
     *v = on_arc(first, a, b, PMSM_C(1.0) - share);
     return pmsm_find_corner(first, second, r, PMSM_CORNER_STEPS, v, steps);

@@ -46,14 +46,12 @@ pmsm_real pmsm_current_limit(const pmsm_period *period)
 pmsm_dq pmsm_limit_current(pmsm_period *period, pmsm_dq i)
 {
     const pmsm_real limit = pmsm_current_limit(period);
-    const pmsm_real square = limit * limit;
-    if (pmsm_square(i) <= square) {
+    if (pmsm_is_within(i, limit) != 0u) {
         return i;
     }
     period->flags |= (uint32_t)PMSM_FLAG_CURRENT_LIMITED;
     i.d = pmsm_clamp(i.d, -limit, limit);
-    const pmsm_real rest = square - i.d * i.d;
-    const pmsm_real i_q = (rest > PMSM_C(0.0)) ? PMSM_SQRT(rest) : PMSM_C(0.0);
+    const pmsm_real i_q = PMSM_SQRT(pmsm_max(limit * limit - i.d * i.d, PMSM_C(0.0)));
     i.q = (i.q < PMSM_C(0.0)) ? -i_q : i_q;
     return i;
 }
@@ -128,9 +126,9 @@ static pmsm_real torque_cut(const pmsm_state *state)
     const pmsm_real granted = state->tau_granted / PMSM_C(0.95);
     const pmsm_real asked = state->tau_speed;
     if (asked > PMSM_C(0.0)) {
-        return (granted < asked) ? ((granted > PMSM_C(0.0)) ? granted : PMSM_C(0.0)) - asked : PMSM_C(0.0);
+        return (granted < asked) ? pmsm_max(granted, PMSM_C(0.0)) - asked : PMSM_C(0.0);
     }
-    return (granted > asked) ? ((granted < PMSM_C(0.0)) ? granted : PMSM_C(0.0)) - asked : PMSM_C(0.0);
+    return (granted > asked) ? pmsm_min(granted, PMSM_C(0.0)) - asked : PMSM_C(0.0);
 }
 
 static pmsm_real speed_update(pmsm_period *period)

@@ -48,7 +48,7 @@ static table_place find_place(const pmsm_period *period, pmsm_dq i)
     table_place at;
     at.size_q = pmsm_abs(i.q);
     at.edge.d = pmsm_clamp(i.d, i_d_min, (pmsm_real)p->saturation_i_d_max_a);
-    at.edge.q = (at.size_q < i_q_max) ? at.size_q : i_q_max;
+    at.edge.q = pmsm_min(at.size_q, i_q_max);
     const uint32_t row =
         left_node((at.edge.d - i_d_min) * derived->nodes_per_ampere.d, p->saturation_n_d, &at.right.d);
     const uint32_t column = left_node(at.edge.q * derived->nodes_per_ampere.q, p->saturation_n_q, &at.right.q);
