@@ -100,12 +100,13 @@ def test_a_pdo_is_lent_and_comes_back(
         ([STATUS_WORD, 0x60780010], 2, "entry 2 of the PDO names an object that the drive lacks (0x60780010)"),
         ([0x10000020], 1, ""), ([0x10500020], 1, "names an object that the drive lacks"),
         ([0x00000000], 1, "entry 1 of the PDO"), ([STATUS_WORD], 65, "multiplexed"),
-        ([STATUS_WORD, 0x60780010], 1, ""),
+        ([STATUS_WORD, 0x60780010], 1, ""), ([STATUS_WORD] * 8, 64, ""),
     ],
 )  # fmt: skip
 def test_a_pdo_that_could_not_be_brought_back_is_not_lent(words: list[int], count: int, named: str) -> None:
     with with_pdo(pdo_objects(0x1800, words)) as (table, node):
         table.objects[0x1A00, 0] = bytes((count,))
+        table.objects |= {(0x1A00, sub): table.objects[0x1A00, 1] for sub in range(9, count + 1)}
         if not named:
             assert BorrowedPdo.read(node, 0x1800, 0x1A00, 1).count == count
             return
@@ -568,7 +569,7 @@ def test_the_drives_own_limits_are_lowered_to_the_envelope(more: Held, bounded: 
                 assert quantity is not None and table.number(quantity.item) == expected[1]
 
 
-@pytest.mark.parametrize(("ratio", "refused"), [(29.9, False), (30.1, True), (math.inf, True), (math.nan, True)])
+@pytest.mark.parametrize(("ratio", "refused"), [(30.0, False), (30.1, True), (math.inf, True), (math.nan, True)])
 def test_a_limit_of_more_than_thirty_times_the_rated_current_is_none(ratio: float, refused: bool) -> None:
     with node_of(RATED, GENERIC) as (_, node):
         drive: Any = SimpleNamespace(node=node, commands_bounded_current=True, shows_apk=math.inf)

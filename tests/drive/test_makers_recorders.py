@@ -281,8 +281,9 @@ def test_a_block_that_came_twice_is_refused(commanded: Rig) -> None:
         return first[-1] if len(first) < 3 else honest()  # the third takes two blocks off
 
     entry.source = twice
-    with pytest.raises(VerifyMismatch, match="damaged"):
+    with pytest.raises(VerifyMismatch, match="damaged") as caught:
         commanded.record(500)
+    assert caught.value.differences == ("a block of 512 bytes took 1024 off the count, 512 were due",)
 
 
 @MONITOR_ONLY

@@ -323,7 +323,7 @@ def test_an_oscillation_is_the_spread_of_twenty_samples() -> None:
         watch.take(5.0)
     assert watch.largest_a == pytest.approx(1.0), "the largest counts"
     watch.check("node 1")
-    for limit, ended in ((1.01, False), (0.99, True)):
+    for limit, ended in ((watch.largest_a, False), (0.99, True)):
         watch.limit_a = limit
         if ended:
             with pytest.raises(LimitExceeded, match="oscillation") as caught:

@@ -7,7 +7,7 @@ import pytest
 
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.recorders.choice import recorder_of
+from pmsmtool.drive.recorders.choice import described, recorder_of
 from pmsmtool.drive.recorders.ingenia import MonitorRecorder
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import BusError, NotAvailable, PmsmtoolError, SdoAbort, VerifyMismatch
@@ -105,6 +105,7 @@ def test_a_drive_without_a_readable_recorder_says_so() -> None:
 def test_a_drive_whose_map_is_wrong_about_it_says_so(family: str, what: str) -> None:
     with connect("pmsmsim", "interior-2k2?nv=:memory:&drive=epos4") as connection:
         node = DriveNode(connection, 1, drive_map=load_family(family))
-        with pytest.raises(NotAvailable, match=f"no {what}"):
+        with pytest.raises(NotAvailable, match=f"no {what}") as caught:
             recorder_of(node, T_S)
+        assert described(node) == f"not read: {caught.value.what}" + f" ({caught.value.hint})" * bool(caught.value.hint)
         node.close()

@@ -14,7 +14,7 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.drive import motion_objects as motion
 from pmsmtool.drive import objects
 from pmsmtool.drive.objects import DriveObject
-from pmsmtool.drive.vendor_tuning import COMMAND_MODE, POLL_S, VendorDrive
+from pmsmtool.drive.vendor_tuning import COMMAND_MODE, FAILED_WITH_CODE, POLL_S, VendorDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.drive_maps.vendor_tuning import VendorStep
@@ -92,6 +92,7 @@ def test_it_is_enabled_in_the_mode_that_its_identification_takes() -> None:
 def test_an_answer_is_read_by_the_map(name: str, answer: bytes, value: float | None) -> None:
     """Big endian, from the third byte on: 0x0102 mohm, 0x10000 uH."""
     table, step, waited = Identifying(answer), STEPS[name], list[float]()
+    table.objects[0x1023, 3] = bytes((FAILED_WITH_CODE,)).ljust(8, b"\0")  # of a command before
     with vendor(table) as drive:
         clock = drive.node.connection.clock
 
