@@ -35,7 +35,7 @@ SURE = 6.0
 """Amplitude of an order, in standard deviations, from which on it is there: 800 are looked for."""
 LEAST_SPEED = 0.2
 """Speed below which a coasting is not used, of its first: near standstill a torque does more than ripple."""
-LEAST_TURNS = 1.0
+LEAST_WAY_RAD = math.tau
 SHAFT_STEPS = 3  # of a fixed point: an error of 1 degree is left with its fourth power, 1e-7 rad
 LEAST_ROWS = 100
 
@@ -118,7 +118,7 @@ def angle_harmonics(coastings: Sequence[tuple[Array, Array, Array]]) -> AngleHar
     """
     used = [(fast_part(t, theta), t, theta, std) for t, theta, std in coastings]
     parts = [(t[:n], theta[:n], std[:n]) for n, t, theta, std in used]
-    parts = [part for part in parts if len(part[0]) > LEAST_ROWS and np.ptp(part[1]) > 2.0 * math.pi * LEAST_TURNS]
+    parts = [part for part in parts if len(part[0]) > LEAST_ROWS and np.ptp(part[1]) > LEAST_WAY_RAD]
     if not parts:
         return AngleHarmonics()
     turns = min(float(np.ptp(theta)) for _, theta, _ in parts) / (2.0 * math.pi)
@@ -132,7 +132,7 @@ def angle_harmonics(coastings: Sequence[tuple[Array, Array, Array]]) -> AngleHar
         rows = []
         for (angle, speed, std), basis in zip(smooth, bases, strict=True):
             size = (1.0 if of == ENCODER else -1.0 / (order * speed) ** 2) / std
-            size = size * np.sign(speed) if of == FRICTION else size
+            size = np.copysign(size, -speed) if of == FRICTION else size
             rows.append(np.stack([_without(basis, size * wave(order * angle)) for wave in (np.cos, np.sin)], axis=1))
         return np.concatenate(rows)
 

@@ -118,7 +118,7 @@ def estimate_encoder(forward: Trace, backward: Trace, limit_rad: float = LINEARI
             f"limit {INTEGER_LIMIT:g} from an integer",
             stage=STAGE,
         )
-    direction = 1 if mean > 0.0 else -1
+    direction = int(math.copysign(1.0, mean))
     offsets = []
     for trace in (forward, backward):
         turns = abs(float(np.ptp(trace["theta_M_rad"]))) / (2.0 * math.pi)

@@ -128,7 +128,7 @@ def estimate_pushes(
     floor = math.hypot(L_Q_FLOOR, L_Q_PER_ERROR * V_dead / found.reactance_v)
     L_q_systematic = math.hypot(abs(L_q_h) * math.hypot(tolerance.impedance, floor), turned)
     return PushResult(
-        R=R if R_ohm > 0.0 and total_half_width(R) <= R_LIMIT * R_ohm else None,
+        R=R if total_half_width(R) <= R_LIMIT * R_ohm else None,
         psi_f=psi,
         L_q=estimate(L_q_h, found.std[3], "H", L_q_systematic),
         frame_offset=estimate(math.atan2(psi_d, psi_q), found.std[2] / size, "rad", FRAME_FLOOR_RAD),

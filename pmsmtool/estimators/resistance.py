@@ -278,7 +278,7 @@ def estimate_resistance(
         std=std,
         systematic=math.hypot(tolerance.impedance * R_w, hidden),
         unit="ohm",
-        n=int(np.sum(np.abs(i) >= FIT_FROM * peak)),
+        n=int(np.sum(_fitted(i, peak))),
         chi2=chi2,
         T_c=T_w,
         method="multi-level DC, asymptotic slope",
@@ -362,6 +362,10 @@ def _level_sigma(t: Array, fall: Array, i: Array, v: Array, peak: float, R_0: fl
     return min(max(1.0, math.sqrt(scatter)) * least, math.hypot(noise_v, MODEL_FLOOR * R_0 * peak))
 
 
+def _fitted(i: Array, peak: float) -> NDArray[np.bool_]:
+    return np.abs(i) >= FIT_FROM * peak
+
+
 def two_point_slope(i: Array, v: Array) -> float:
     """Slope between the largest level and the one nearest to 60 % of it, mean of both signs (ohm)."""
     peak = float(np.max(np.abs(i)))
@@ -384,7 +388,7 @@ def two_point_slope(i: Array, v: Array) -> float:
 
 
 def _check_levels(levels: Trace, i: Array, peak: float, noise: Noise) -> None:
-    used = np.abs(i) >= FIT_FROM * peak
+    used = _fitted(i, peak)
     for sign in (1.0, -1.0):
         count = len(set(np.round(i[used & (np.sign(i) == sign)] / (0.02 * peak))))
         if count < TAIL_TERMS + 3:
@@ -415,7 +419,7 @@ def _settling(levels: Trace, noise: Noise) -> tuple[Array, Array]:
     sigma = 2.0 * R_0 * noise.sigma_a / math.sqrt(int(levels.meta["samples"]))  # difference of two halves
     fit_limit = max(SETTLE_SIGMA * max(sigma, ripple), SETTLE_FLOOR * R_0 * peak)
     curve_limit = max(fit_limit, CURVE_SETTLE * float(np.max(np.abs(levels["u_d_v"]))))
-    return change, np.where(np.abs(i) >= FIT_FROM * peak, fit_limit, curve_limit)
+    return change, np.where(_fitted(i, peak), fit_limit, curve_limit)
 
 
 def unsettled(levels: Trace, noise: Noise) -> NDArray[np.bool_]:
@@ -458,7 +462,7 @@ def _fit_tail(
     t: Array, fall: Array, i: Array, v: Array, peak: float, sigma_v: float, powers: tuple[int, ...]
 ) -> _TailFit:
     """Fit the levels: R, V, v_0, drift, what of V falls with the link, and the tail."""
-    used = np.abs(i) >= FIT_FROM * peak
+    used = _fitted(i, peak)
     span = float(np.ptp(t))
     i, v, t, fall = i[used], v[used], t[used], fall[used]
     sign, u = np.sign(i), np.abs(i) / peak

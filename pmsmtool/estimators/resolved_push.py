@@ -185,8 +185,7 @@ def push_blocks(push: Trace, period_s: float, pole_pairs: int) -> Blocks:
     index = np.arange(blocks)
     acceleration = np.polyval(np.polyfit(index, np.gradient(w, step_s), 2), index)
     ahead = w + DELAY_PERIODS * period_s * acceleration
-    x = 0.5 * ahead * period_s
-    sampled = np.where(np.abs(x) > 1e-9, x / np.sin(np.where(np.abs(x) > 1e-9, x, 1.0)), 1.0)
+    sampled = 1.0 / np.sinc(ahead * period_s / (2.0 * math.pi))
     u = (means("u_d_v") + 1j * means("u_q_v")) * sampled * np.exp(1j * DELAY_PERIODS * period_s * (own - w))
     i = means("i_d_a") + 1j * means("i_q_a")
     slope = np.gradient(i, step_s)
@@ -254,11 +253,10 @@ def _columns(shape: Shape, w: Array, i: Rows, slope: Rows, u: Rows) -> list[Rows
     along, share = i / size, size / size.max()
     across = 1j * np.sign(w) * along
     L_q, L_d = -w * i.imag + 0j, 1j * w * i.real
-    one = np.ones_like(i)
     slopes: list[Rows] = [slope.real + 0j, 1j * slope.imag]
     if shape.linear:
         L_q, L_d, slopes = L_q + slopes[1], L_d + slopes[0], []
-    columns = [i, 1j * w, w + 0j, L_q, along, L_d, *slopes, one, 1j * one, along * speed]
+    columns = [i, 1j * w, w + 0j, L_q, along, L_d, *slopes, np.ones_like(i), np.full_like(i, 1j), along * speed]
     columns += [1j * w * u] if shape.turned else []
     columns += [along / share**power for power in shape.along]
     knots = np.linspace(0.0, float(np.quantile(speed, TOP_QUANTILE)), KNOTS)

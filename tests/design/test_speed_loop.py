@@ -116,7 +116,7 @@ def test_symmetric_ratio_is_the_textbook_one() -> None:
 
 
 def test_a_crossover_beyond_the_small_time_constants_is_refused() -> None:
-    with pytest.raises(DesignInfeasible, match="crossover") as refused:
+    with pytest.raises(DesignInfeasible, match="crossover of 370.4 rad/s .* constants, 3 ms") as refused:
         symmetric_optimum(J, 3e-3, 0.9)
     assert "below 53.1 Hz" in refused.value.hint, "1 / (2 pi 3 ms)"
 
@@ -207,6 +207,30 @@ def test_the_loop_of_two_masses_is_that_of_the_axis() -> None:
     other = AxisPath(one.shaft, one.current, DECIMATION, pll_rad_s=PLL, filter_hz=FILTER_HZ)
     theirs = open_loop(lifted(other), other, AxisGains(1.0, 20.0, 1.0), "speed", omega, lifted(other).at(omega))
     assert np.max(np.abs(speed_loop(gains, one).at(omega) / theirs - 1.0)) < TWO_MASSES
+
+
+@pytest.mark.parametrize(("notch", "by_phase"), [(Notch(400.0, 0.1, 0.7), True), (Notch(50.0, 0.02, 1.0), False)])
+def test_the_position_gain_is_as_large_as_its_margins_allow(notch: Notch, by_phase: bool) -> None:
+    """Against the loops of ``axis``: the whole loop is 1 + L = (1 + L_speed)(1 + K_p L_position)."""
+    gains = symmetric_optimum(J, small_time_constants(path(), ALPHA), symmetric_ratio(math.radians(60.0)))
+    one = replace(path(notch), shaft=Mechanics(J, B, 150.0, 400.0, 0.05))
+    K_p, crossover = position_gain(gains, one)
+    assert one.shaft is not None
+    other = AxisPath(one.shaft, one.current, DECIMATION, pll_rad_s=PLL, filter_hz=FILTER_HZ)
+    omega = np.geomspace(1e-3, 0.99, 2000) * math.pi / (DECIMATION * T_S)
+    plant, theirs = lifted(other), AxisGains(gains.K_p, gains.K_i, K_p, notch)
+    seen = plant.at(omega)
+    whole, speed = (open_loop(plant, other, theirs, loop, omega, seen) for loop in ("position", "speed"))
+    loop = (whole - speed) / (1.0 + speed)
+    lag = -np.degrees(np.unwrap(np.angle(loop)))
+    crossed = np.abs(loop) >= 1.0
+    assert crossover == pytest.approx(omega[crossed][-1], rel=0.01)
+    assert np.abs(loop[lag >= 180.0]).max() <= 0.5
+    least, most = np.abs(1.0 + loop).min(), lag[crossed].max()
+    if by_phase:
+        assert most == pytest.approx(120.0, abs=0.3) and least > 0.53  # measured 120.1 degree, 0.68
+    else:
+        assert 0.499 < least < 0.53 and most < 119.0  # the gain falls by steps of 5 %: measured 0.5002, 104 degree
 
 
 def test_a_speed_loop_is_as_slow_as_an_elastic_shaft_needs() -> None:

@@ -12,9 +12,12 @@ import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators import estimate as gates
+from pmsmtool.estimators import resistance
 from pmsmtool.estimators.cross_check import JUDGES, CrossCheck
 from pmsmtool.estimators.flux import linkage_rows
+from pmsmtool.estimators.flux.map_rows import smooth_angle
 from pmsmtool.estimators.flux.voltage_flux import current_rise
+from pmsmtool.estimators.injection import sampling_instant
 from pmsmtool.estimators.injection.inductance import _pulse_height
 from pmsmtool.estimators.injection.sampling_instant import Sampling
 from pmsmtool.estimators.injection.switching_ripple import Modulation
@@ -137,3 +140,30 @@ def test_columns_that_are_nearly_one_another_are_refused() -> None:
 
 def test_a_current_that_rises() -> None:
     assert current_rise(trace(np.arange(4.0), i_q_a=[1.0, 1.0, 2.0, 2.0])) == 0.25
+
+
+def test_levels_from_the_least_on_go_into_the_resistance() -> None:
+    assert resistance._fitted(np.array([0.28, -0.28, 0.27, 1.0]), 1.0).tolist() == [True, True, False, True]
+
+
+@pytest.mark.parametrize("t", [0.05, 0.3, 0.7])
+def test_a_lag_rounds_periodic_pulses(t: float) -> None:
+    """Against the lag's exponentials one after another, before, within and after the pulse."""
+    on, off, lag = 0.2, 0.5, 0.15
+    rise, fall = math.exp(-(off - on) / lag), math.exp(-(1.0 - off + on) / lag)
+    begun = (1.0 - rise) * fall / (1.0 - rise * fall)  # where the pulse begins
+    ended = 1.0 + (begun - 1.0) * rise
+    expected = (
+        begun * math.exp((on - t) / lag) if t < on
+        else 1.0 + (begun - 1.0) * math.exp((on - t) / lag) if t < off
+        else ended * math.exp((off - t) / lag)
+    )  # fmt: skip
+    found = sampling_instant._lagging(np.array([on]), np.array([off]), t, lag, 1.0)
+    assert found[0] == pytest.approx(expected, rel=ROUNDING)
+
+
+def test_what_binary32_rounds_is_no_step_of_an_encoder() -> None:
+    t = np.linspace(0.0, 1.0, 400)
+    theta = (300.0 + 3.0 * t + 8.0 * t**2).astype(np.float32).astype(np.float64)
+    i = np.stack([np.cos(theta), np.sin(theta)])
+    assert smooth_angle(theta, i, 0.1 * i[::-1], 1e-3) is theta

@@ -341,10 +341,10 @@ def test_every_value_of_the_vector_has_its_place_and_its_size() -> None:
 def test_priors_are_distances_in_their_deviations() -> None:
     found = FULL.prior(VECTOR)
     expected = [
-        0.2 / axis_layout.EDDY_R_PRIOR_STD, 0.4 / axis_layout.DELAY_PRIOR_STD,
+        0.2 / axis_layout.EDDY_R_PRIOR_STD, 0.4,
         (-2.5 - math.log(axis_layout.LAG_CENTRE)) / axis_layout.LAG_PRIOR_STD,
         0.7 / axis_layout.BEND_PRIOR_STD, -0.3 / axis_layout.BEND_PRIOR_STD, 2.0 / axis_layout.MOTION_PRIOR_STD,
-        0.05 / axis_layout.RATIO_PRIOR_STD, -0.08 / axis_layout.RATIO_PRIOR_STD, 0.4 / axis_layout.EDDY_PRIOR_STD,
+        0.05 / axis_layout.RATIO_PRIOR_STD, -0.08 / axis_layout.RATIO_PRIOR_STD, 0.4,
         (-1.0 - math.log(axis_layout.EDDY_TAU_CENTRE)) / axis_layout.EDDY_TAU_PRIOR_STD,
     ]  # fmt: skip
     assert found == pytest.approx(expected, rel=EXACT)

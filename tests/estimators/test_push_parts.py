@@ -113,8 +113,9 @@ def test_a_flux_linkage_that_scatters_is_refused_and_a_resistance_left_out(
 
 def test_negative_numbers_of_recorded_pushes_are_none(monkeypatch: pytest.MonkeyPatch) -> None:
     assert _judged(monkeypatch, R_ohm=-0.4).R is None
-    with pytest.raises(IdentificationError, match=r"E_EXCITATION: the voltage over speed is -0.2 Wb"):
-        _judged(monkeypatch, psi_q=-0.2)
+    for psi_q in (-0.2, 0.0):
+        with pytest.raises(IdentificationError, match=rf"E_EXCITATION: the voltage over speed is {psi_q:g} Wb"):
+            _judged(monkeypatch, psi_q=psi_q)
     with pytest.raises(
         IdentificationError, match=f"E_EXCITATION: {LEAST_PUSHES - 1} torque pulses, {LEAST_PUSHES} needed"
     ):

@@ -83,6 +83,31 @@ def test_the_offset_is_that_of_pairs_of_electrical_turns(pairs: int, direction: 
         EncoderResult(Estimate(1.0, 0.0, 0.0, "1"), 1, coarse, 0.4), *_rotation(1, 1.1, 3.0)[:2]
     )
     assert short is coarse
+    two = position.offset_by_turns(
+        EncoderResult(Estimate(1.0, 0.0, 0.0, "1"), 1, coarse, 0.4), *_rotation(1, 2.1, 3.0)[:2]
+    )
+    assert two.dof == 1.0
+
+
+def test_a_trace_of_just_enough_steps_shows_the_encoder() -> None:
+    theta = 2.0**-10 * np.cumsum([0, *[1, 0] * (position.ENCODER_STEPS_LEAST - 1), 1])
+    assert position.encoder_step([theta, 2.0 * theta]) == 2.0**-10
+    with pytest.raises(IdentificationError, match="50 steps of the encoder are needed"):
+        position.encoder_step([theta[:-1], 2.0 * theta])
+
+
+def test_the_least_coherent_lines_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    n = 40
+    omega, ones = np.arange(1.0, n + 1.0), np.ones((1, n), dtype=np.complex128)
+    inner = n - 2 * fr.HALF_WIDTH
+    G, std = ones[0, :inner], np.ones(inner)
+    monkeypatch.setattr(fr, "_fit", lambda *_: None)
+    for count in (fr.COHERENT_LEAST, fr.COHERENT_LEAST - 1):
+        coherence = np.where(np.arange(inner) < count, fr.COHERENT, 0.0)
+        monkeypatch.setattr(fr, "local_polynomials", lambda *_, seen=coherence: (G, std, std, seen))
+        told = pytest.raises(IdentificationError, match="7 of .* lines have a coherence of 0.5, 8 are needed")
+        with nullcontext() if count == fr.COHERENT_LEAST else told:
+            fr._rigid_shaft(omega, ones, ones, 1e-3, np.zeros(n))
 
 
 # ---- blocks and their motion ------------------------------------------------------------------------------------

@@ -405,8 +405,8 @@ def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
 
 def _rough_L_d(rows: Corrected, which: NDArray[np.int64]) -> float:
     """L_d from u_q (H): the two windows of a pair differ a little in speed."""
-    w, i_d = rows.w[which], rows.i_d[which]
-    columns = np.stack([w, w * i_d, np.sign(w) * np.sign(i_d)], axis=1)
+    w, across = rows.w[which], rows.w[which] * rows.i_d[which]
+    columns = np.stack([w, across, np.sign(across)], axis=1)
     return float(np.linalg.lstsq(columns, rows.u_q[which], rcond=None)[0][1])
 
 

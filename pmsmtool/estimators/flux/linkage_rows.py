@@ -185,7 +185,7 @@ def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]]) -> None:
     """
     w = speeds["omega_e_rad_s"]
     for sign, name in ((1.0, "forward"), (-1.0, "backward")):
-        mine = np.array([abs(w[k]) for k, _ in pairs if w[k] * sign > 0.0])
+        mine = np.array([abs(w[k]) for k, _ in pairs if np.sign(w[k]) == sign])
         if len(mine) < MINIMUM_PAIRS or float(np.max(mine)) < SPEED_RATIO * float(np.min(mine)):
             raise refuse(
                 "E_EXCITATION",

@@ -14,8 +14,8 @@ from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Response
 from pmsmtool.estimators.injection.output_error import AxisModel
 from pmsmtool.estimators.injection.sampling_instant import ShownInstant
 
-DELAY_CENTRE, DELAY_PRIOR_STD = 1.0, 1.0
-"""Sample to voltage (T_s). A sample within a zero vector does not show it: nothing kept it, and L had 48 %."""
+DELAY_CENTRE = 1.0
+"""Sample to voltage (T_s), +-1. A sample within a zero vector does not show it: nothing kept it, and L had 48 %."""
 LAG_CENTRE = 0.1
 """Centre of the prior of the sensor time constant (T_s)."""
 LAG_PRIOR_STD = 1.5
@@ -28,8 +28,6 @@ MOTION_PRIOR_STD = 10.0
 """Prior of the motional term, in hundredths of L over the square of a half period."""
 RATIO_PRIOR_STD = 0.3
 """Prior of the relative difference of L and R between injection frequencies."""
-EDDY_PRIOR_STD = 1.0
-"""Prior of the eddy current per voltage, relative to T_s/L: 5 % of iron loss make 0.1 to 1.3, an eddy branch 0.1."""
 EDDY_TAU_CENTRE, EDDY_TAU_PRIOR_STD = 0.5, 1.5
 """Centre (T_s) and standard deviation (of the logarithm) of the prior of its time constant."""
 EDDY_R_PRIOR_STD = 0.05
@@ -183,7 +181,7 @@ class Layout:
         """Residuals of the weak priors that keep an undetermined effect from running away."""
         parts = self.split(x)
         rows = [(parts["main"][1] - 1.0) / (EDDY_R_PRIOR_STD if self.effects.eddy else R_PRIOR_STD)]
-        rows.append((parts["main"][2] - DELAY_CENTRE) / DELAY_PRIOR_STD)
+        rows.append(parts["main"][2] - DELAY_CENTRE)
         if self.timing is not None:
             rows += self.timing.prior(parts["main"][2], parts["lag"][0] if self.effects.lag else None)
         elif self.effects.lag:
@@ -199,8 +197,8 @@ class Layout:
                 rows.append((value * self.motion_scale - self.motion.per_f) / self.motion.std_per_f)
         rows += [value / RATIO_PRIOR_STD for value in parts.get("dispersion", [])]
         if self.effects.eddy:
-            eddy, log_tau = parts["eddy"]
-            rows += [eddy / EDDY_PRIOR_STD, (log_tau - math.log(EDDY_TAU_CENTRE)) / EDDY_TAU_PRIOR_STD]
+            eddy, log_tau = parts["eddy"]  # per voltage over T_s/L: 5 % of iron loss make 0.1 to 1.3, a branch 0.1
+            rows += [eddy, (log_tau - math.log(EDDY_TAU_CENTRE)) / EDDY_TAU_PRIOR_STD]
         return np.array(rows)
 
     def changed(self, x: Array, effects: Effects) -> tuple[Layout, Array]:

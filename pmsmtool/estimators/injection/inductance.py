@@ -480,8 +480,7 @@ def _axis_angle(fits: Mapping[str, AxisFit], cross: Mapping[str, tuple[float, fl
     if difference < ANISOTROPY_LIMIT * (g_d + g_q):
         return math.nan, math.nan
     # frame ahead by eps: G' = R(-eps) G R(eps), so 2 g_dq = -(g_d - g_q)_true sin(2 eps)
-    sense = math.copysign(1.0, g_d - g_q)
-    return 0.5 * math.atan2(-2.0 * sense * g_dq, abs(g_d - g_q)), std / difference
+    return 0.5 * math.atan2(-math.copysign(2.0, g_d - g_q) * g_dq, abs(g_d - g_q)), std / difference
 
 
 def _unmix(

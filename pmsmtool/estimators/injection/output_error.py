@@ -32,7 +32,7 @@ FIRST_SAMPLE = 3
 PULSE_CENTRES = (0.25, 0.75)
 PULSES_EACH = 0.5
 """Middles of the two pulses in a period of centre-aligned modulation, and the part of the command that each carries."""
-PULSE_EDGES = np.array([[c, 0.5 * side * PULSES_EACH] for c in PULSE_CENTRES for side in (-1.0, 1.0)])
+PULSE_EDGES = np.array([[c, side * PULSES_EACH] for c in PULSE_CENTRES for side in (-0.5, 0.5)])
 WIDTH_NODES = np.cos(math.pi * (np.arange(5) + 0.5) / 5.0)
 WIDTHS_TO_POWERS = np.linalg.inv(np.vander(WIDTH_NODES, increasing=True))
 """Widths in -1 ... 1 at which the effect of a pulse is calculated, and what makes a polynomial of it (measured: 1e-9 of

@@ -263,7 +263,7 @@ def _ripple(lines: _Lines, rigid: Fit, runs: Sequence[Trace], direction: int, co
 
     waves, pairs = [], []
     for order in range(1, RIPPLE_ORDERS + 1):
-        torques = [[wave(order * direction * run["theta_M_rad"]) for run in runs] for wave in (np.cos, np.sin)]
+        torques = [[wave(order * (direction * run["theta_M_rad"])) for run in runs] for wave in (np.cos, np.sin)]
         waves.append([transforms(runs, both, direction)[1][:, :count] for both in torques])
         pairs.append(np.stack([whitened(G * wave[:, HALF_WIDTH : count - HALF_WIDTH]) for wave in waves[-1]], axis=1))
     asked = max(1.0, rigid.cost / rigid.dof) * (2.0 * math.log(len(rigid.residual)) + INFORMATION_GAIN)
@@ -336,7 +336,7 @@ def _start(omega: Array, G: Complex, std: Array) -> Array | None:
             target = _stacked(G, std)
             b, _, _, _ = np.linalg.lstsq(rows, target, rcond=None)
             cost = float(np.sum((rows @ b - target) ** 2))
-            if cost < best and b[0] > 0.0 and b[2] > 0.0 and b[0] < b[2]:
+            if cost < best and 0.0 < b[0] < b[2]:
                 w_a = w_r * math.sqrt(b[0] / b[2])
                 best = cost
                 zeta_a = 0.5 * b[1] / math.sqrt(b[0] * b[2])

@@ -209,7 +209,8 @@ def regress(columns: Sequence[Array], measured: Array, *, what: str, stage: str)
     if np.any(scale == 0.0):
         raise refuse("E_NOT_IDENTIFIABLE", f"the shaft did not turn during the torque pulses, for {what}", stage=stage)
     solution, _, _, singular = np.linalg.lstsq(matrix / scale, measured, rcond=None)
-    condition = float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf
+    with np.errstate(divide="ignore"):
+        condition = float(singular[0] / singular[-1])
     if condition > CONDITION_LIMIT:
         raise refuse("E_NOT_IDENTIFIABLE", f"condition {condition:.3g} of {what} together", stage=stage)
     return np.asarray(solution / scale)

@@ -132,7 +132,7 @@ def whitener(run: Run, J: float) -> Array:
     if run.torque_std == 0.0:
         return np.diag(1.0 / run.theta_std)
     lag = np.arange(n)[:, None] - np.arange(n - 1)[None, :] - 0.5
-    G = np.where(lag > 0.0, lag, 0.0) * run.T**2 / J
+    G = np.maximum(lag, 0.0) * run.T**2 / J
     covariance = np.diag(run.theta_std**2) + run.torque_std**2 * (G @ G.T)
     factor = np.linalg.cholesky(covariance)
     return np.asarray(np.linalg.inv(factor))
