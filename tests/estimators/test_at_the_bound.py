@@ -4,23 +4,34 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators import estimate as gates
-from pmsmtool.estimators import resistance
+from pmsmtool.estimators import resistance, tracking_model
 from pmsmtool.estimators.cross_check import JUDGES, CrossCheck
+from pmsmtool.estimators.encoder import check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.flux import linkage_rows
 from pmsmtool.estimators.flux.map_rows import smooth_angle
-from pmsmtool.estimators.flux.voltage_flux import current_rise
-from pmsmtool.estimators.injection import sampling_instant
+from pmsmtool.estimators.flux.voltage_flux import (
+    HELD_SHARE,
+    RISING,
+    current_rise,
+    flux_by_voltage_limit,
+    voltage_drift,
+)
+from pmsmtool.estimators.injection import inductance, sampling_instant
 from pmsmtool.estimators.injection.inductance import _pulse_height
 from pmsmtool.estimators.injection.sampling_instant import Sampling
 from pmsmtool.estimators.injection.switching_ripple import Modulation
+from pmsmtool.estimators.inverter_error import InverterCurve, curve_from_levels
 from pmsmtool.estimators.noise import MINIMUM_SAMPLES, estimate_noise
 from pmsmtool.estimators.resistance import Copper, copper_of, resistance_warmed
 from pmsmtool.estimators.sensor_mismatch import LEAST, SURE, SensorMismatch
@@ -167,3 +178,73 @@ def test_what_binary32_rounds_is_no_step_of_an_encoder() -> None:
     theta = (300.0 + 3.0 * t + 8.0 * t**2).astype(np.float32).astype(np.float64)
     i = np.stack([np.cos(theta), np.sin(theta)])
     assert smooth_angle(theta, i, 0.1 * i[::-1], 1e-3) is theta
+
+
+def test_half_of_the_voltage_error_and_calm_windows_belong_to_them() -> None:
+    tail = tracking_model.tail_of(InverterCurve(np.array([1.0, 2.0, 4.0]), np.array([1.0, 2.0, 4.0]), 0.0))
+    assert tail.u_error_v == pytest.approx(np.array([1.0, 2.0, 4.0]) * 2.0 / np.array([3.0, 4.0, 6.0]))
+    rises = trace(np.arange(4.0), d_rise_a=[0.5, -0.5, 0.6, 0.0], q_rise_a=[0.0] * 4, omega_rise_rad_s=[0.0] * 4)
+    limit = dict.fromkeys(tracking_model.RISES, 0.5)
+    assert tracking_model._calm(rises, limit).tolist() == [True, True, False, False]
+
+
+def test_levels_of_one_current_are_one_point_of_the_curve() -> None:
+    curve = curve_from_levels(np.array([10.0, -11.0]), np.array([1.0, -2.0]), 1.0)
+    assert (curve.i_phase_a.tolist(), curve.u_error_v.tolist()) == ([10.5], [1.5])
+    assert len(curve_from_levels(np.array([10.0, -11.1]), np.array([1.0, -2.0]), 1.0).i_phase_a) == 2
+
+
+def test_what_stands_still_at_the_voltage_limit_says_nothing() -> None:
+    t = 0.01 * np.arange(64)
+
+    def limit(theta: np.ndarray, first: float, second: float) -> float:
+        i = np.repeat([first, second], 32)
+        top = trace(t, theta_M_rad=theta, i_q_a=i, U_dc_v=300.0 + 0.0 * t)
+        return flux_by_voltage_limit(top, pole_pairs=4, utilisation=0.5).value
+
+    with pytest.raises(IdentificationError, match="the speed at the voltage limit is not steady"):
+        limit(0.0 * t, 0.0, 0.0)
+    assert limit(50.0 * t, HELD_SHARE * 4.0, HELD_SHARE * 4.0) == pytest.approx(0.5 * 300.0 / 200.0)
+    assert limit(50.0 * t, 0.0, RISING * 4.0) == pytest.approx(0.5 * 300.0 / 200.0)
+    for first, second in ((3.5, 3.5), (0.0, 0.1)):
+        with pytest.raises(IdentificationError):
+            limit(50.0 * t, first, second)
+    coast = trace(t, theta_M_rad=50.0 * t, u_d_v=0.0 * t, u_q_v=0.0 * t)
+    assert voltage_drift(coast) == 0.0
+
+
+def test_the_least_way_shows_an_encoder() -> None:
+    """A quarter of what 64 pole pairs would turn."""
+    for measured, told in ((0.25, nullcontext()), (0.249, pytest.raises(IdentificationError, match="E_ENCODER"))):
+        with told:
+            check_encoder_counts(trace(np.arange(2.0), theta_imposed_rad=[0.0, 64.0], theta_M_rad=[0.0, measured]))
+
+
+def test_a_rotation_without_any_deviation_meets_every_limit() -> None:
+    theta = np.linspace(0.0, 8.0, 129)
+    ahead = trace(theta, theta_imposed_rad=4.0 * theta, theta_M_rad=theta)
+    back = trace(theta, theta_imposed_rad=4.0 * theta[::-1], theta_M_rad=theta[::-1])
+    found = estimate_encoder(ahead, back, limit_rad=0.0)
+    assert (found.pole_pairs.value, found.direction) == (4.0, 1)
+
+
+def test_a_resistance_of_nothing_is_none() -> None:
+    with pytest.raises(IdentificationError, match="cannot be separated"):
+        resistance._check_result(0.0, 0.0, math.inf)
+    resistance._check_result(2.0, 0.1, gates.COVERAGE_FACTOR * 0.1 / 2.0)
+
+
+def test_a_fit_at_its_limit_is_not_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    fit = SimpleNamespace(chi2=gates.CHI2_REFUSE, residuals=[np.zeros(1)])
+    monkeypatch.setattr(inductance, "fit_axis", lambda *_, **__: fit)
+    monkeypatch.setattr(inductance, "with_line", lambda *_: pytest.fail("made again"))
+    shots = {axis: [cast(Any, None)] for axis in "dq"}
+    assert inductance._fitted(shots, 0.1, 1.0, None, None) == {"d": fit, "q": fit}
+
+
+def test_a_q_current_of_the_least_share_is_one() -> None:
+    T, one = 1e-4, np.ones(2)
+    speeds = trace(np.arange(2.0), i_d_a=-2.0 * one, i_q_a=linkage_rows.Q_SHARE * 2.0 * one, u_d_v=one, u_q_v=one,
+                   omega_e_rad_s=500.0 * one, omega_first_rad_s=500.0 * one, omega_second_rad_s=500.0 * one,
+                   half_s=one)  # fmt: skip
+    assert not linkage_rows.corrected(speeds, 0.0, T, None, None, 0.0).is_d.any()

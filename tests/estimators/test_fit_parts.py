@@ -325,7 +325,7 @@ def test_ratios_are_coefficients_over_the_rise_by_the_current() -> None:
 
 def _ratios(
     monkeypatch: pytest.MonkeyPatch, plain: Sequence[float], salient: Sequence[float], stds: tuple[float, float, float],
-    *, i_d: bool, whole: Sequence[float] = (3.0, 0.25),
+    *, i_d: bool, whole: Sequence[float] = (3.0, 0.25), pushes: int = 5,
 ) -> dict[str, Any]:  # fmt: skip
     """Estimates where the regressions without and with a d current have these results; five pushes of 2 and 4 A."""
     monkeypatch.setattr(
@@ -346,7 +346,7 @@ def _ratios(
     monkeypatch.setattr(inertia_ratio, "_with_spread", spread)
     monkeypatch.setattr(inertia_ratio, "_amplitude_excess", lambda _: 0.015)
     return inertia_ratio.estimate_ratios(
-        [_push(i_d=i_d)] * 5, pole_pairs=4, tolerance=SensorTolerance(current_gain=0.02)
+        [_push(i_d=i_d)] * pushes, pole_pairs=4, tolerance=SensorTolerance(current_gain=0.02)
     )
 
 
@@ -369,6 +369,13 @@ def test_a_d_current_counts_where_it_surely_changes_the_inertia(monkeypatch: pyt
         weakest = 6.0 * 4.0
         assert friction.systematic == pytest.approx(math.hypot(0.02 * tau, FRICTION_FLOOR * weakest), rel=EXACT)
         assert (ratio.n, ratio.dof, friction.std) == (100, 4.0, 0.02)
+
+
+def test_the_least_pushes_are_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = pytest.raises(IdentificationError, match="3 usable torque pulses, 4 needed")
+    for pushes in (inertia_ratio.LEAST_PUSHES, inertia_ratio.LEAST_PUSHES - 1):
+        with nullcontext() if pushes == inertia_ratio.LEAST_PUSHES else told:
+            _ratios(monkeypatch, (3.0, 0.3), (3.0, 0.3), (0.01, 9.0, 9.0), i_d=True, pushes=pushes)
 
 
 def test_an_inertia_that_scatters_by_a_tenth_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -498,6 +505,13 @@ def test_means_of_halves_are_doubted_by_their_scatter_and_the_torques_scale(monk
     t = 1e-2 * np.arange(101.0)
     traces = [trace_of(t, {"coasting": k % 2 == 1}, theta_M_rad=0.01 * np.floor(1e2 * (t + t * t)), flagged=0.0 * t,
                      i_d_a=0.0 * t, i_q_a=0.5 + 0.0 * t) for k in range(4)]  # fmt: skip
+    for nothing in (0.0, -1e-3):
+        monkeypatch.setattr(
+            mechanics, "_mean_motion", lambda blocks, power=0.0, J=nothing: (np.array([J, -1e-3, 0.05]), [0.0] * 3, [])
+        )
+        assert mechanics.mean_mechanics(traces, lambda d, q: q, 0.03, 1) == {}
+        with pytest.raises(IdentificationError, match="J = "):
+            mechanics._start([])
     for stds, kept in (([1e-5, 1e-3, 0.02], 3), ([1e-5, 0.1, 0.02], 1), ([1e-5, 1e-3, 0.3], 1)):
         monkeypatch.setattr(
             mechanics, "_mean_motion", lambda blocks, power, stds=stds: (np.array([2e-3, -1e-3, 0.05]), stds, [])

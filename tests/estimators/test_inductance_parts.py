@@ -108,9 +108,9 @@ def test_the_frame_is_taken_out_with_the_deviations_of_all_three(at_d: float, at
 
 def test_a_frame_more_than_thirty_degrees_off_is_refused() -> None:
     fits, widen = {"d": _fit(L_D), "q": _fit(L_Q)}, {"d": 1.0, "q": 1.0}
-    for off in (29.9, -29.9, 30.1, -30.1):
+    for off in (29.9, -29.9, 30.0, -30.0, 30.1, -30.1):
         told = pytest.raises(IdentificationError, match=f"the frame is {off:.3g} deg off the d axis")
-        with nullcontext() if abs(off) < 30.0 else told:
+        with nullcontext() if abs(off) <= 30.0 else told:
             inductance._unmix(fits, widen, FrameAhead(math.radians(off), 0.0, 0.0))
 
 

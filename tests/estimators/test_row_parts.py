@@ -297,6 +297,44 @@ def test_records_go_in_with_cogging_and_without_the_noise_of_their_current(monke
     assert band.start == 4
 
 
+@pytest.mark.parametrize(("gains", "asked", "taken"), [((0.0,), 0, 0), ((1.0, 0.0), 1, 1), ((1.0, 1.0), 1, 0)])
+def test_a_ripple_is_taken_along_where_no_second_mass_is_left(
+    monkeypatch: pytest.MonkeyPatch, gains: tuple[float, ...], asked: int, taken: int
+) -> None:
+    """Gains beyond what the criterion asks of a second mass, without and with the ripple."""
+    n = 3000
+    t = 2e-4 * np.arange(n)
+    run = trace_of(t, theta_M_rad=20.0 * t, i_d_a=0.0 * t, i_q_a=np.sin(900.0 * t), flagged=0.0 * t)
+    nothing = np.zeros(0)
+    results = [
+        fr.FrequencyResponse(nothing, nothing + 0j, nothing, nothing, 0.0, 1.0, 1.0, fr.INFORMATION_GAIN + gain)
+        for gain in gains
+    ]
+    told, ripples = iter(results), []
+
+    def ripple(*_: Any) -> float:
+        ripples.append(1)
+        return 0.0
+
+    monkeypatch.setattr(fr, "_judged", lambda *_: (next(told), None, None))
+    monkeypatch.setattr(fr, "_ripple", ripple)
+    found = fr.estimate_frequency_response([run] * 3, lambda d, q: q)
+    assert found is results[taken] and len(ripples) == asked
+
+
+def test_a_record_needs_lines_to_average_over() -> None:
+    """The longest record that is refused lacks one."""
+    lines = 0
+    for n in range(100, 2000):
+        t = 1e-3 * np.arange(n)
+        try:
+            response_lines.transforms([trace_of(t, theta_M_rad=t)], [t], 1)
+            break
+        except IdentificationError as refused:
+            lines = int(str(refused).split(" lines")[0].split()[-1])
+    assert lines == response_lines.LINES_LEAST + 2 * fr.HALF_WIDTH - 1
+
+
 def test_records_must_be_three_of_one_length_that_turn_and_are_not_limited() -> None:
     n = 3000
     t = 2e-4 * np.arange(n)
