@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 
 from pmsmtool.design import field_weakening, governor, polar
+from pmsmtool.design import ratings as rating
 from pmsmtool.design import tune as tuning
 from pmsmtool.design.admissible_set import Horizon, PredictionModel
+from pmsmtool.design.closed_drive import _Projection
 from pmsmtool.design.lookup import grid, table
 from pmsmtool.design.lookup.design import LookupRequest, _fitting
 from pmsmtool.design.lookup.grid import GridBounds, table_words
@@ -213,6 +215,39 @@ def test_a_grid_may_fill_the_memory() -> None:
                 cast(LookupTable, None), (nodes, nodes, ends), GridBounds(1.0, 1.0, capacity_words=capacity)
             )
         assert (found is not None) is fits
+
+
+def test_bounds_that_are_just_met_need_no_finer_grid(monkeypatch: pytest.MonkeyPatch) -> None:
+    found, axis = cast(LookupTable, SimpleNamespace()), np.arange(3.0)
+    met = grid.InterpolationError(0.5, 2.0, 0.0, 0)
+    monkeypatch.setattr(grid, "as_stored", lambda *_: found)
+    monkeypatch.setattr(grid, "cell_errors", lambda *_: np.zeros((2, 2, 3, 3)))
+    monkeypatch.setattr(grid, "_bounds", lambda *_: met)
+    assert grid.refined_table(lambda *_: found, axis, axis, np.ones(1), GridBounds(0.5, 2.0)) == (found, met)
+
+
+def test_ratings_that_are_their_own_limits_keep_their_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = load_machine_file(PROFILE)
+    V = 0.9 * source.inverter.V_max_v
+    free = ratings(source, V)
+    at_most = SimpleNamespace(trip_most_rpm=free.n_trip_rpm, n_most_rpm=free.n_max_rpm)
+    monkeypatch.setattr(rating, "fault_reaction", lambda *_: at_most)
+    given = replace(source, limits=replace(source.limits, tau_max_nm=free.tau_max_nm))
+    assert ratings(given, V).methods == free.methods
+    below = SimpleNamespace(trip_most_rpm=0.99 * free.n_trip_rpm, n_most_rpm=0.99 * free.n_max_rpm)
+    monkeypatch.setattr(rating, "fault_reaction", lambda *_: below)
+    told = ratings(source, V).methods
+    assert "uncontrolled generation" in told["n_trip"] and "uncontrolled generation" in told["n_max"]
+    weakened = rating.MAGNET_SHARE * source.machine.psi_f_wb / source.machine.L_d_decoupling_h
+    assert rating._assumed_i_d_min(source.machine, weakened, 99.0)[1].startswith("assumed: -I_nom")
+
+
+def test_a_closed_drive_may_take_all_of_its_limits() -> None:
+    for demand, deviation, held in ((1.0, 2.0, True), (1.1, 2.0, False), (1.0, 2.1, False)):
+        drive = SimpleNamespace(
+            demand=lambda *_, told=(demand, deviation): told, limit=1.0, rated=SimpleNamespace(I_max_apk=5.0)
+        )
+        assert _Projection.holds(cast(_Projection, drive), 3.0, 0.0, 1) is held
 
 
 def test_a_cell_without_a_solution_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -257,6 +257,15 @@ def test_rows_count_by_their_beats_and_large_residuals_less() -> None:
         assert without[j] == pytest.approx(less[:5], rel=1e-6)
 
 
+def test_columns_that_differ_only_where_nothing_counts_are_refused() -> None:
+    rng = np.random.default_rng(15)
+    columns = [rng.standard_normal(40) + 1j * rng.standard_normal(40) for _ in range(6)]
+    first = np.arange(40) < 5
+    columns[1] = columns[0] + np.where(first, columns[1], 0.0)
+    with pytest.raises(IdentificationError, match="condition .* of R, psi, L_q"):
+        resolved_push._fit(columns, columns[2], np.where(first, 1e-9, 1.0), np.arange(40) // 10, 4)
+
+
 def test_a_column_of_nothing_counts_only_where_it_is_told() -> None:
     rng = np.random.default_rng(14)
     columns = [rng.standard_normal(20) + 1j * rng.standard_normal(20) for _ in range(6)]
