@@ -15,7 +15,7 @@ import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators import estimate as gates
-from pmsmtool.estimators import resistance, tracking_model
+from pmsmtool.estimators import resistance, tracking, tracking_model
 from pmsmtool.estimators.cross_check import JUDGES, CrossCheck
 from pmsmtool.estimators.encoder import check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.flux import linkage_rows
@@ -249,3 +249,10 @@ def test_a_q_current_of_the_least_share_is_one() -> None:
                    omega_e_rad_s=500.0 * one, omega_first_rad_s=500.0 * one, omega_second_rad_s=500.0 * one,
                    half_s=one)  # fmt: skip
     assert not linkage_rows.corrected(speeds, 0.0, T, None, None, 0.0).is_d.any()
+
+
+def test_noise_is_widened_until_it_agrees_or_is_twice_the_assumed(monkeypatch: pytest.MonkeyPatch) -> None:
+    for nis, inflation in ((tracking.NIS_GATE[1], 1.0), (4.0, 4.0)):  # from twice the noise on once more
+        monkeypatch.setattr(tracking, "_pass", lambda *_, nis=nis: (None, nis, 0.0))
+        nothing = cast(Any, None)
+        assert tracking._consistent(nothing, nothing, nothing, (0.1, 0.1), 0.0).inflation == inflation

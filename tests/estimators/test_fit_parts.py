@@ -198,6 +198,17 @@ def test_d_currents_count_from_six_and_a_half_ripples_on(
         assert shown is not None and (shown.std_s > 1.01 * floor) is (share > least)
 
 
+def test_five_pairs_show_an_instant(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sampling_instant, "sampled_ripple", lambda voltage, *_: np.zeros((2, len(voltage[0]))))
+    w, level = np.repeat([300.0, 500.0, 700.0, -400.0, -900.0], 2), np.tile([10.0, -10.0], 5)
+    modulation = Modulation(300.0, (3e-3, 5e-3), 50e-6, 1e-6)
+    for n in (5, 4):
+        zero = np.zeros(2 * n)
+        pairs = [(2 * k, 2 * k + 1) for k in range(n)]
+        rows = CoastingPairs(w[: 2 * n], zero, level[: 2 * n], zero, zero, 0.1 * w[: 2 * n], pairs)
+        assert (shown_instant(rows, 0.4, 0.1, modulation, 1.0) is not None) is (n == 5)
+
+
 def test_the_curve_at_an_edge_begins_where_the_capacitance_takes_half_of_the_plateau() -> None:
     modulation = Modulation(300.0, (3e-3, 5e-3), 50e-6, 1e-6)
     assert modulation.plateau_v == pytest.approx(6.0, rel=EXACT)

@@ -323,12 +323,13 @@ def test_a_ripple_is_taken_along_where_no_second_mass_is_left(
 
 
 def test_a_record_needs_lines_to_average_over() -> None:
-    """The longest record that is refused lacks one."""
+    """The longest record that is refused lacks one; the first is the fourth, for three on either side make its mean."""
     lines = 0
     for n in range(100, 2000):
         t = 1e-3 * np.arange(n)
         try:
-            response_lines.transforms([trace_of(t, theta_M_rad=t)], [t], 1)
+            omega, *_ = response_lines.transforms([trace_of(t, theta_M_rad=t)], [t], 1)
+            assert omega[0] == pytest.approx(2.0 * math.pi * (fr.HALF_WIDTH + 1) / (1e-3 * (n - 2)))
             break
         except IdentificationError as refused:
             lines = int(str(refused).split(" lines")[0].split()[-1])
