@@ -126,7 +126,7 @@ def estimate_encoder(forward: Trace, backward: Trace, limit_rad: float = LINEARI
             raise refuse("E_EXCITATION", f"the rotor turned {turns:.2f} times, {MINIMUM_TURNS:g} needed", stage=STAGE)
         deviation = direction * count * trace["theta_M_rad"] - trace["theta_imposed_rad"]
         centre = _circular_mean(deviation)
-        worst = float(np.max(np.abs(_wrap(deviation - centre))))
+        worst = float(np.max(np.abs(wrapped(deviation - centre))))
         if worst > limit_rad:
             raise refuse(
                 "E_ROTOR_MOVED",
@@ -136,9 +136,9 @@ def estimate_encoder(forward: Trace, backward: Trace, limit_rad: float = LINEARI
                 likely="cogging or a load stronger than the holding torque",
                 hint="raise the current (--i-max) or free the shaft",
             )
-        offsets.append((centre, float(np.std(_wrap(deviation - centre)))))
-    lag = 0.5 * float(_wrap(np.array([offsets[0][0] - offsets[1][0]]))[0])
-    offset = float(_wrap(np.array([offsets[1][0] + lag]))[0])
+        offsets.append((centre, float(np.std(wrapped(deviation - centre)))))
+    lag = 0.5 * float(wrapped(np.array([offsets[0][0] - offsets[1][0]]))[0])
+    offset = float(wrapped(np.array([offsets[1][0] + lag]))[0])
     scatter = math.hypot(offsets[0][1], offsets[1][1]) / 2.0
     return EncoderResult(
         pole_pairs=Estimate(float(count), distance, 0.0, "1", n=len(forward) + len(backward), method="slow rotation"),
@@ -198,8 +198,9 @@ def _slope(trace: Trace) -> float:
     return float(turned @ turned) / along if along else math.inf
 
 
-def _wrap(angle: Array) -> Array:
-    return np.asarray((angle + np.pi) % (2.0 * np.pi) - np.pi)
+def wrapped(angle: Array) -> Array:
+    """Return angles (rad) within half a turn of zero."""
+    return np.angle(np.exp(1j * angle))
 
 
 def _circular_mean(angle: Array) -> float:

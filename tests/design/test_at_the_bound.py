@@ -228,6 +228,7 @@ def test_bounds_that_are_just_met_need_no_finer_grid(monkeypatch: pytest.MonkeyP
 
 def test_ratings_that_are_their_own_limits_keep_their_reasons(monkeypatch: pytest.MonkeyPatch) -> None:
     source = load_machine_file(PROFILE)
+    source = replace(source, limits=replace(source.limits, tau_max_nm=None))
     V = 0.9 * source.inverter.V_max_v
     free = ratings(source, V)
     at_most = SimpleNamespace(trip_most_rpm=free.n_trip_rpm, n_most_rpm=free.n_max_rpm)

@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.angle_harmonics import AngleHarmonics, Harmonic
 from pmsmtool.estimators.encoder import PER_TURN_LEAST_RAD, PER_TURN_SURE, _per_turn
 from pmsmtool.estimators.flux import map_fit
 from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
 from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.least_squares import Fit
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft import frequency_response as fr
 from pmsmtool.estimators.shaft import mechanics, response_lines, swing
@@ -101,6 +104,67 @@ def test_the_fast_part_of_the_traces_is_taken_where_it_needs_less_noise(
     assert (found[1] == 400) is whole
     with pytest.raises(IdentificationError, match="E_NOT_CONVERGED"):
         mechanics._explained(_fitted([None, None]), [run])
+
+
+def _fit(x: Sequence[float]) -> Fit:
+    return Fit(np.array(x), np.ones(90), np.zeros((90, len(x))), True, 5)
+
+
+def test_cogging_is_taken_along_with_the_inertia_of_the_fit_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is known as an acceleration; what a fit says beyond shaft and states is not kept for the next."""
+    t = 1e-2 * np.arange(101.0)
+    traces = [
+        trace_of(t, {"coasting": k % 2 == 1}, theta_M_rad=0.01 * np.floor(1e2 * (t + t * t)), flagged=0.0 * t)
+        for k in range(4)
+    ]
+    one = Run(np.linspace(0.0, 1.0, 101), np.full(100, 0.5), 1e-2, np.full(101, 1e-4), 1e-4, False)
+    cogging = AngleHarmonics((), (Harmonic(6, 3.0, 0.0, 0.1),), 2.0)
+    begun, first = np.array([math.log(2e-3), 1e-3, 0.05, *range(8)]), [math.log(3e-3), 2e-3, 0.06]
+    states = [10.0 + k for k in range(8)]
+    inertias: list[float] = []
+    starts: list[list[float]] = []
+
+    def blocks(run: Trace, *given: Any) -> tuple[Array, Run]:
+        assert given[-2] is cogging
+        inertias.append(given[-1])
+        return one.theta, one
+
+    def fit(runs: Sequence[Run], start: Array, elastic: bool) -> tuple[Fit, float, Sequence[Run]]:
+        starts.append(start.tolist())
+        return _fit([*first, 7.0, 8.0, 9.0, *states]), 1.0, runs
+
+    class Enough(Exception):
+        pass
+
+    def explained(fitted: Any, runs: Sequence[Trace]) -> Any:
+        fitted(runs)
+        raise Enough
+
+    for name, value in (
+        ("angle_harmonics", lambda _: cogging), ("_blocks", blocks), ("disturbances", lambda *_: one.disturbances),
+        ("_start", lambda _: begun), ("_fit", fit), ("_explained", explained),
+    ):  # fmt: skip
+        monkeypatch.setattr(mechanics, name, value)
+    with pytest.raises(Enough):
+        mechanics.estimate_mechanics(traces, lambda d, q: q, 1.0, 0.01, 0.02)
+    assert inertias == pytest.approx([0.0] * 4 + [2e-3] * 4 + [3e-3] * 4)
+    assert starts == [begun.tolist(), [*first, *states]]
+
+
+def test_noise_of_the_torque_is_refused_beyond_its_limit_unless_it_is_expected(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = Run(np.linspace(0.0, 1.0, 101), np.full(100, 0.5), 4e-3, np.full(101, 1e-4), 1e-4, False)
+    found = _fit([0.0] * 6)
+    monkeypatch.setattr(mechanics, "_minimum", lambda *_: found)
+    monkeypatch.setattr(mechanics, "_noisier", lambda runs, *_: runs)
+
+    def fitted(noise: float, *, elastic: bool) -> Fit:
+        monkeypatch.setattr(mechanics, "_noise", lambda _: {False: noise, True: 0.0})
+        return mechanics._fit([run], np.zeros(5), elastic)[0]
+
+    assert fitted(mechanics.RIPPLE_MOST, elastic=False) is found and fitted(0.2, elastic=True) is found
+    told = r"torque off by 20 % of that of the pulses, and more, from one 4 ms to the next, limit 15 %"
+    with pytest.raises(IdentificationError, match=told):
+        fitted(0.2, elastic=False)
 
 
 # ---- which knee, which slope ------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from pmsmtool.arrays import Array
-from pmsmtool.estimators.encoder import EncoderResult
+from pmsmtool.estimators.encoder import EncoderResult, wrapped
 from pmsmtool.estimators.estimate import MEDIAN_TO_STD
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
@@ -149,7 +149,7 @@ def _by_turn(found: EncoderResult, trace: Trace) -> Array:
     """Return the mean deviation from the found offset in every whole electrical turn of a run."""
     imposed = np.asarray(trace["theta_imposed_rad"], dtype=np.float64)
     ahead = found.direction * round(found.pole_pairs.value) * np.asarray(trace["theta_M_rad"], dtype=np.float64)
-    off = np.asarray((ahead - imposed - found.offset.value + math.pi) % (2.0 * math.pi) - math.pi)
+    off = wrapped(ahead - imposed - found.offset.value)
     steps = max(1, round(2.0 * math.pi / abs(float(imposed[1] - imposed[0]))))
     turns = len(off) // steps
     return np.asarray(off[: turns * steps].reshape(turns, steps).mean(axis=1))
