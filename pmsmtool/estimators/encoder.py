@@ -200,7 +200,7 @@ def _slope(trace: Trace) -> float:
 
 def wrapped(angle: Array) -> Array:
     """Return angles (rad) within half a turn of zero."""
-    return np.angle(np.exp(1j * angle))
+    return np.asarray(np.angle(np.exp(1j * angle)))
 
 
 def _circular_mean(angle: Array) -> float:
