@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-import control
 import numpy as np
 import pytest
 
@@ -16,6 +16,9 @@ from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, notch_coefficients, speed_loop
 from pmsmtool.machine.two_masses import Mechanics
+
+if TYPE_CHECKING:
+    import control  # loaded by the tests that compare with it: 1.6 s, in every worker that collects this file
 
 T = 4e-4
 CURRENT = axis_loop(imc(0.5, 2e-3, 900.0), AxisPlant(0.5, 2e-3, T, 1.5))
@@ -29,12 +32,16 @@ COARSE = 1e-3
 
 def other_plant(shaft: Mechanics, current: SampledLoop) -> control.StateSpace:
     """Torque to angle with python-control: closed current loop, then the shaft behind a first-order hold."""
+    import control
+
     closed = control.tf(current.num, np.polyadd(current.den, current.num), T)
     A, b, c = shaft.system()
     return control.sample_system(control.ss(A, b[:, None], c[1:2], 0.0), T, method="foh") * control.ss(closed)
 
 
 def other_loop(path: AxisPath, gains: AxisGains) -> control.StateSpace:
+    import control
+
     z = control.tf([1, 0], [1], T)
     notch = control.tf(*notch_coefficients(gains.notch, T), T) if gains.notch.hz else 1.0
     if path.structure == "pid":
