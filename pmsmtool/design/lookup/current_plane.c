@@ -16,16 +16,6 @@
 #define EDGE_NODES 18       /* of one side of the rectangle */
 #define HALF_PI 1.57079632679489661923
 
-static double larger(double a, double b)
-{
-    return a > b ? a : b;
-}
-
-static double smaller(double a, double b)
-{
-    return a < b ? a : b;
-}
-
 static double square(double a)
 {
     return a * a;
@@ -90,9 +80,9 @@ int32_t pmsm_on_branch(const pmsm_plane *plane, const pmsm_point *at)
 double pmsm_plane_outside(const pmsm_plane *plane, const pmsm_rectangle *r, const pmsm_point *at)
 {
     const double I = plane->I_max;
-    const double across = larger(r->d_low - at->d, at->d - r->d_high) / I;
-    const double along = larger(r->q_low - at->q, at->q - r->q_high) / I;
-    return larger(0.5 * (at->h / (I * I) - 1.0), larger(across, along));
+    const double across = fmax(r->d_low - at->d, at->d - r->d_high) / I;
+    const double along = fmax(r->q_low - at->q, at->q - r->q_high) / I;
+    return fmax(0.5 * (at->h / (I * I) - 1.0), fmax(across, along));
 }
 
 double pmsm_voltage_squared(const pmsm_plane *plane, const pmsm_point *at, double omega)
@@ -163,7 +153,7 @@ int32_t pmsm_curve_correct(const pmsm_curve *curve, pmsm_point *at)
         if (fabs(error) < before) {
             level_gradient(curve, at, gradient);
             slope = square(gradient[0]) + square(gradient[1]);
-            floor = 64.0 * CORRECTED * larger(size, curve->plane->I_max * sqrt(slope)); /* of flux that nearly cancels */
+            floor = 64.0 * CORRECTED * fmax(size, curve->plane->I_max * sqrt(slope)); /* of flux that nearly cancels */
             if (!(slope > 0.0))
                 break;
             from = *at;
@@ -272,7 +262,7 @@ static int32_t span_root(const span *over, enum pmsm_indicator what, double f_a,
                          pmsm_point *root)
 {
     double x_a = 0.0, x_b = 1.0;
-    const double scale = larger(fabs(f_a), fabs(f_b));
+    const double scale = fmax(fabs(f_a), fabs(f_b));
     if (!(f_a * f_b <= 0.0))
         return 0;
     for (int32_t k = 0; k < ROOT_STEPS_MAX; k++) {
@@ -424,12 +414,12 @@ static void add_lines(pmsm_border *border, const pmsm_plane *plane, double radiu
         const double d = k ? r->d_high : r->d_low, q = k ? r->q_high : r->q_low;
         if (fabs(d) < radius) {
             const double reach = sqrt(square(radius) - square(d));
-            add_piece(border, plane, PMSM_CURVE_VERTICAL, d, larger(-reach, r->q_low), smaller(reach, r->q_high),
+            add_piece(border, plane, PMSM_CURVE_VERTICAL, d, fmax(-reach, r->q_low), fmin(reach, r->q_high),
                       EDGE_NODES);
         }
         if (fabs(q) < radius) {
             const double reach = sqrt(square(radius) - square(q));
-            add_piece(border, plane, PMSM_CURVE_HORIZONTAL, q, larger(-reach, r->d_low), smaller(reach, r->d_high),
+            add_piece(border, plane, PMSM_CURVE_HORIZONTAL, q, fmax(-reach, r->d_low), fmin(reach, r->d_high),
                       EDGE_NODES);
         }
     }

@@ -41,7 +41,7 @@ static interpolated interpolate(const grid *g, int32_t ix, int32_t iy, int32_t i
         at.q += w * g->i_q[cell];
         weight += w;
     }
-    if (at.holes && weight > 0.0) {
+    if (at.holes) {
         at.d /= weight;
         at.q /= weight;
     }
@@ -52,27 +52,17 @@ typedef struct {
     double torque, voltage, current; /* errors, see the header */
 } errors;
 
-static double larger(double a, double b)
-{
-    return a > b ? a : b;
-}
-
 static void sample(const pmsm_plane *plane, const interpolated *i, double torque, const double *range, double omega,
                    double limit, errors *e)
 {
     const double scale = 1.5 * plane->pole_pairs;
-    double wanted = torque;
     pmsm_point at;
     if (i->corners == 0 || isnan(range[0]))
         return; /* no point in the table, or none that could be right */
-    if (wanted < range[0])
-        wanted = range[0];
-    if (wanted > range[1])
-        wanted = range[1];
     pmsm_plane_at(plane, i->d, i->q, &at);
-    e->torque = larger(e->torque, fabs(scale * at.t - wanted));
-    e->voltage = larger(e->voltage, sqrt(pmsm_voltage_squared(plane, &at, omega)) - limit);
-    e->current = larger(e->current, sqrt(at.h) - plane->I_max);
+    e->torque = fmax(e->torque, fabs(scale * at.t - fmin(fmax(torque, range[0]), range[1])));
+    e->voltage = fmax(e->voltage, sqrt(pmsm_voltage_squared(plane, &at, omega)) - limit);
+    e->current = fmax(e->current, sqrt(at.h) - plane->I_max);
 }
 
 /* Node number of a fine axis and the share inside its cell. */
@@ -93,7 +83,7 @@ void pmsm_lookup_error(const pmsm_plane *plane, int32_t n_x, const double *x, in
                        const double *i_q, int32_t m, const double *range, double *worst)
 {
     const grid g = {x, y, z, n_x, n_y, n_z, i_d, i_q};
-    const int32_t f_x = (n_x - 1) * m + 1, f_y = (n_y - 1) * m + 1, f_z = n_z > 1 ? (n_z - 1) * m + 1 : 1;
+    const int32_t f_x = (n_x - 1) * m + 1, f_y = (n_y - 1) * m + 1, f_z = (n_z - 1) * m + 1;
     for (ptrdiff_t k = 0; k < (ptrdiff_t)(n_x - 1) * (n_y - 1) * 9; k++)
         worst[k] = -INFINITY;
     for (int32_t ky = 0; ky < f_y; ky++)
@@ -101,9 +91,10 @@ void pmsm_lookup_error(const pmsm_plane *plane, int32_t n_x, const double *x, in
             int32_t iy, iz;
             double b, c, y_k, omega, V;
             y_k = fine(y, n_y, m, ky, &iy, &b);
-            (void)fine(z, n_z, m, kz, &iz, &c);
+            V = fine(limit ? limit : z, n_z, m, kz, &iz, &c);
+            if (!limit)
+                V = y_k;
             omega = omega_per_y ? *omega_per_y * y_k : 1.0;
-            V = limit ? limit[iz] + c * (limit[n_z > 1 ? iz + 1 : iz] - limit[iz]) : y_k;
             for (int32_t kx = 0; kx < f_x; kx++) {
                 int32_t ix;
                 double a, *w;
@@ -113,9 +104,9 @@ void pmsm_lookup_error(const pmsm_plane *plane, int32_t n_x, const double *x, in
                 const int32_t kind = b == 0.0 || b == 1.0 ? 0 : a == 0.0 || a == 1.0 ? 1 : 2;
                 sample(plane, &at, torque, range + 2 * ((ptrdiff_t)ky * f_z + kz), omega, V, &e);
                 w = worst + 9 * ((ptrdiff_t)ix * (n_y - 1) + iy) + 3 * kind;
-                w[0] = larger(w[0], e.torque);
-                w[1] = larger(w[1], e.voltage);
-                w[2] = larger(w[2], e.current);
+                w[0] = fmax(w[0], e.torque);
+                w[1] = fmax(w[1], e.voltage);
+                w[2] = fmax(w[2], e.current);
             }
         }
 }

@@ -154,10 +154,8 @@ void pmsm_contour_trace(pmsm_contour *c, int32_t which, double length)
             return;
         if (pmsm_plane_outside(c->curve.plane, c->curve.rectangle, next) > 0.0) {
             pmsm_point edge;
-            if (to->n > 1 || pmsm_plane_outside(c->curve.plane, c->curve.rectangle, from) < -1e-12)
-                if (pmsm_curve_root(&c->curve, PMSM_AT_EDGE, from, next, &edge)) {
-                    to->at[to->n++] = edge;
-                }
+            if (pmsm_curve_root(&c->curve, PMSM_AT_EDGE, from, next, &edge))
+                to->at[to->n++] = edge;
             return;
         }
         to->rising &= next->h >= from->h;

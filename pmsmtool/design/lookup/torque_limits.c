@@ -197,9 +197,7 @@ static void closed_limit(search *run)
         return;
     up.kind = PMSM_CURVE_VERTICAL;
     up.level = centre.d;
-    top = sqrt(I2 - centre.d * centre.d);
-    if (top > run->border->rectangle.q_high)
-        top = run->border->rectangle.q_high;
+    top = fmin(sqrt(I2 - centre.d * centre.d), run->border->rectangle.q_high);
     if (!pmsm_curve_root_between(&up, PMSM_AT_VOLTAGE, centre.q, top, &s, &start))
         return;
     consider(run, &start);
