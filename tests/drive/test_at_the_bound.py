@@ -14,8 +14,12 @@ from pmsmtool.drive import motion_objects as motion
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import LEAST_LINK_V
 from pmsmtool.drive.mapped_recorder_drive import LINEAR_SHARE, MappedRecorderDrive
+from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Recording
 from pmsmtool.drive.position_drive import PositionDrive
+from pmsmtool.drive_maps.drive_map import LETTERS
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import NotAvailable
 from pmsmtool.trace import Trace
 from tests.drive.table_drive import node_of
@@ -93,3 +97,19 @@ def test_the_angle_of_one_count() -> None:
     drive = object.__new__(PositionDrive)
     drive.counts_per_turn = -4000
     assert drive.rad_per_count == pytest.approx(2.0 * math.pi / 4000.0, rel=1e-15)
+
+
+def test_a_value_is_held_where_map_and_drive_have_it() -> None:
+    """Not of another type than the map's, nor without the value that it counts in, nor what no map names."""
+    family = load_family("ingenia")
+    K_i, K_p = (family.cells[f"current.{name}"] for name in ("K_i_q_v_per_as", "K_p_q_v_per_a"))
+    assert K_i.gain == K_p.name
+    gain, rate = (DriveObject(cell.index, cell.sub, LETTERS[cell.wire]) for cell in (K_p, K_i))
+    with node_of({gain: 2, rate: 3}, family) as (table, node):
+        values = DriveParameters(node)
+        assert values.held_value(K_i.name) == values.read_value(K_i.name) > 0.0
+        assert values.held_value("motor.warp_factor") is None
+        table.objects[rate.index, rate.sub] += b"\0"
+        assert values.held_value(K_i.name) is None and values.held_value(K_p.name) == values.read_value(K_p.name)
+        del table.objects[gain.index, gain.sub]
+        assert values.held_value(K_i.name) is None

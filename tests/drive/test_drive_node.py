@@ -341,7 +341,8 @@ def test_a_quick_stop_has_the_time_of_its_ramp(
         assert bool(said) == (stops_s > 0.5)
         if said:
             assert said[0] == f"braking, up to {min(60.0, 2.0 * abs(rpm) / told):.0f} s"
-            assert all(text.startswith("braking, ") for text in said)
+            shown = [float(text.removeprefix("braking, ").removesuffix(" rpm")) for text in said[1:]]
+            assert all(speed <= 1.05 * abs(rpm) for speed in shown) and shown[0] > 0.8 * abs(rpm)
 
 
 def test_a_drive_that_keeps_its_voltage_is_not_confirmed() -> None:

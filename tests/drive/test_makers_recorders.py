@@ -14,7 +14,7 @@ import pytest
 
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.recorders.choice import recorder_of
+from pmsmtool.drive.recorders.choice import described, recorder_of
 from pmsmtool.drive.recorders.commanded import CommandedRecorder
 from pmsmtool.drive_maps import copley_objects, epos2_objects, ingenia_objects
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
@@ -57,6 +57,8 @@ def test_it_says_what_it_can_take_and_how_fast(commanded: Rig) -> None:
     assert isinstance(commanded.recorder, CommandedRecorder)
     assert set(commanded.kind.signals) <= set(commanded.recorder.signals)
     assert commanded.recorder.period_s == pytest.approx(T_S, rel=WHOLE_NS)
+    named = ", ".join(commanded.recorder.signals)
+    assert described(commanded.node) == f"{commanded.recorder.what} of {named}, every {1e6 * T_S:.4g} us"
 
 
 @COMMANDED

@@ -27,7 +27,9 @@ def test_a_record_is_complete_and_in_order(opened: Opener, samples: int, decimat
     """Sizes around the blocks of 512 bytes (64 rows of two signals) and around segments."""
     rig = opened()
     samples = min(samples, rig.kind.capacity_rows)
-    check(rig.record(samples, decimation), samples, decimation, rig.kind.quantum_v)
+    trace = rig.record(samples, decimation)
+    check(trace, samples, decimation, rig.kind.quantum_v)
+    assert trace.meta.get("control_period_s", T_S) == pytest.approx(T_S, rel=1e-5)
 
 
 def test_one_record_after_another(opened: Opener) -> None:
@@ -48,8 +50,9 @@ def test_the_largest_record_fits_and_one_row_more_does_not(opened: Opener) -> No
 
 def test_a_signal_it_has_not_is_named(opened: Opener) -> None:
     rig = opened()
-    with pytest.raises(NotAvailable, match="warp_factor"):
+    with pytest.raises(NotAvailable, match="warp_factor") as caught:
         rig.recorder.arm(("warp_factor",), 10, 1, 0, at_excitation=False)
+    assert all(name in caught.value.hint for name in rig.kind.signals) or rig.kind.family == "pmsmsim"
 
 
 @pytest.mark.chain
@@ -98,6 +101,8 @@ def test_a_drive_without_a_readable_recorder_says_so() -> None:
         node = DriveNode(connection, 1, drive_map=load_family("elmo"))
         with pytest.raises(NotAvailable, match="no recorder that this program reads"):
             recorder_of(node, T_S)
+        assert described(node).startswith("not read: the drive map 'elmo' has no recorder")
+        assert described(DriveNode(connection, 1, drive_map=load_family("epos4"))) == "", "the map names none"
         node.close()
 
 

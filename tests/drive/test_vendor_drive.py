@@ -95,6 +95,7 @@ def test_an_answer_is_read_by_the_map(name: str, answer: bytes, value: float | N
     table.objects[0x1023, 3] = bytes((FAILED_WITH_CODE,)).ljust(8, b"\0")  # of a command before
     with vendor(table) as drive:
         clock = drive.node.connection.clock
+        clock.wait(1.0)
 
         def wait(seconds: float) -> None:
             waited.append(seconds)

@@ -3,6 +3,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -115,6 +116,27 @@ def backup(tmp_path_factory) -> Snapshot:
     rig = open_rig(tmp_path_factory.mktemp("rig"))
     found = take_backup(rig.node, rig.identity)
     return replace(found, identity=replace(found.identity, serial=22001))  # of the profile interior-2k2
+
+
+def test_what_counts_as_old_until_another_set_follows(tmp_path: Path) -> None:
+    """What stood there before the first of interrupted or repeated downloads; another set begins anew."""
+    who = Identity(5, 1, 2, 3, 4, "", "", "")
+    folder = JournalFolder(who, tmp_path)
+
+    def begun(old: bytes, new: bytes) -> bytes:
+        entries = (Entry("motor.R_s_ohm", 0x3000, 1, old, new),)
+        return folder.begin(Snapshot("journal", "open", who, 0, "0" * 64, entries)).entries[0].old
+
+    def done() -> None:
+        last = folder.last()
+        assert last is not None
+        folder.close(last, "done")
+
+    assert begun(b"\1", b"\2") == b"\1" and begun(b"\2", b"\3") == b"\1", "the first was interrupted"
+    done()
+    assert begun(b"\3", b"\3") == b"\1", "the same set again"
+    done()
+    assert begun(b"\3", b"\4") == b"\3", "another set"
 
 
 def test_only_the_reference_set_has_a_layout(backup: Snapshot) -> None:
