@@ -114,3 +114,21 @@ def test_polar_law_equals_the_twin_bit_for_bit(case: str) -> None:
     assert flags & FLAGS.get(case, 0) == FLAGS.get(case, 0)
     assert len(switched) == (2 if "switched" in case else 1)
     assert moved > 0.3 * size or rpm > 1200  # the loop did follow; deep in field weakening the limits leave less
+
+
+@pytest.mark.parametrize("rpm", [1100.0, -1300.0])
+def test_the_unified_law_rests_where_voltage_and_current_limit_meet(rpm: float) -> None:
+    """Asked for more than both allow, it holds both limits: i_q gives way on the voltage circle.
+
+    Three Newton steps leave 0.4 and 1.3 % of the current limit, and 4e-4 of the voltage.
+    """
+    limits = {"motor__I_max_apk": 20.0, "protection__I_cont_apk": 20.0, "field_weakening__i_d_min_a": -60.0}
+    settings = values(UNIFIED, polar__V_ref_ratio=0.97, **limits, **SALIENT)
+    loop = Loop(core(double=True), settings, omega=rpm * RPM, U_dc=U_DC)
+    for _ in range(400):
+        live = loop.step(mode=MODE_CURRENT, i_q_ref=math.copysign(40.0, rpm))
+    i, plant = complex(live.i_d_ref, live.i_q_ref), loop.plant
+    rotation = plant.omega * complex(-plant.L_q * i.imag, plant.L_d * i.real + plant.psi)
+    assert abs(i) == pytest.approx(20.0, rel=0.02) and i.imag * rpm > 0.0
+    assert abs(plant.R * i + rotation) == pytest.approx(0.97 * U_DC / math.sqrt(3), rel=1e-3)
+    assert plant.i == pytest.approx([i.real, i.imag], abs=0.01)
