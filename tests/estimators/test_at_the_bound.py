@@ -17,7 +17,7 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators import estimate as gates
 from pmsmtool.estimators import resistance, tracking, tracking_model
 from pmsmtool.estimators.cross_check import JUDGES, CrossCheck
-from pmsmtool.estimators.encoder import check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.encoder import MINIMUM_TURNS, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.flux import linkage_rows
 from pmsmtool.estimators.flux.map_rows import smooth_angle
 from pmsmtool.estimators.flux.voltage_flux import (
@@ -36,6 +36,8 @@ from pmsmtool.estimators.noise import MINIMUM_SAMPLES, estimate_noise
 from pmsmtool.estimators.resistance import Copper, copper_of, resistance_warmed
 from pmsmtool.estimators.sensor_mismatch import LEAST, SURE, SensorMismatch
 from pmsmtool.estimators.shaft.inertia_ratio import regress
+from pmsmtool.estimators.shaft.mechanics import require_useful
+from pmsmtool.estimators.shaft.model import Run
 from pmsmtool.estimators.shaft.motion import DECAY_MOST, _coast, _stops_after, positions
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import Estimate
@@ -227,6 +229,22 @@ def test_a_rotation_without_any_deviation_meets_every_limit() -> None:
     back = trace(theta, theta_imposed_rad=4.0 * theta[::-1], theta_M_rad=theta[::-1])
     found = estimate_encoder(ahead, back, limit_rad=0.0)
     assert (found.pole_pairs.value, found.direction) == (4.0, 1)
+
+
+def test_a_rotation_may_be_just_long_enough() -> None:
+    way = MINIMUM_TURNS * math.tau
+    for last, told in ((way, nullcontext()), (0.999 * way, pytest.raises(IdentificationError, match="times, 0.98"))):
+        theta = np.linspace(0.0, last, 129)
+        runs = (trace(theta, theta_imposed_rad=3.0 * part, theta_M_rad=part) for part in (theta, theta[::-1]))
+        with told:
+            estimate_encoder(*runs)
+
+
+def test_friction_that_may_be_just_all_of_the_torque_is_useful() -> None:
+    run = Run(np.zeros(3), np.full(2, 0.25 * gates.COVERAGE_FACTOR), 1.0, np.ones(3), 0.0, False)
+    require_useful([run], 0.0, 0.25)
+    with pytest.raises(IdentificationError, match="friction is known to"):
+        require_useful([run], 0.0, 0.2501)
 
 
 def test_a_resistance_of_nothing_is_none() -> None:
