@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.arrays import Array
+from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS, Harmonic
 from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
@@ -57,15 +58,21 @@ class EncoderResult:
         Offset in theta_e = direction p theta_M - offset (rad electrical), within (-pi, pi].
     lag_rad : float
         Half the difference between forward and backward run: what friction holds back (rad electrical).
-    per_turn_rad : tuple of float
-        Error of the encoder once and twice per turn (rad mechanical, amplitude); 0 where it is not clear.
+    per_turn : tuple of Harmonic
+        What the rotation shows of the encoder's error once and twice per turn (rad mechanical), along the phase order.
     """
 
     pole_pairs: Estimate
     direction: int
     offset: Estimate
     lag_rad: float
-    per_turn_rad: tuple[float, float] = (0.0, 0.0)
+    per_turn: tuple[Harmonic, ...] = ()
+
+    @property
+    def per_turn_rad(self) -> tuple[float, ...]:
+        """Amplitudes of that (rad); 0 where it is not clear."""
+        limits = [max(PER_TURN_LEAST_RAD, PER_TURN_SURE * h.std) for h in self.per_turn]
+        return tuple(h.amplitude * (h.amplitude > least) for h, least in zip(self.per_turn, limits, strict=True))
 
 
 def check_encoder_counts(turned: Trace) -> None:
@@ -152,29 +159,31 @@ def estimate_encoder(forward: Trace, backward: Trace, limit_rad: float = LINEARI
             method="slow rotation, mean of both directions (coarse)",
         ),
         lag_rad=lag,
-        per_turn_rad=_per_turn(forward, backward, direction * count),
+        per_turn=_per_turn(forward, backward, direction, count),
     )
 
 
-def _per_turn(forward: Trace, backward: Trace, pole_pairs: int) -> tuple[float, float]:
-    """Return the clear part of the encoder's error once and twice per turn (rad mechanical).
+def _per_turn(forward: Trace, backward: Trace, direction: int, pole_pairs: int) -> tuple[Harmonic, ...]:
+    """Return what both directions show of the encoder's error once and twice per turn (rad mechanical).
 
     A rotor that sticks and slips behind the vector leaves something of every order: what does not stand out of the
     others is not the encoder's. Multiples of the pole pairs are left out: offsets of the current sensors have them.
     """
-    p = abs(pole_pairs)
-    orders = [1, 2, *(k for k in range(3, PER_TURN_ORDERS + 1) if p == 1 or k % p)]
+    p = pole_pairs
+    orders = [*ENCODER_ORDERS, *(k for k in range(3, PER_TURN_ORDERS + 1) if p == 1 or k % p)]
     found = []
     for trace in (forward, backward):
-        theta = trace["theta_M_rad"]
+        theta = direction * trace["theta_M_rad"]
         columns = [np.ones_like(theta), *(wave(k * theta) for k in orders for wave in (np.cos, np.sin))]
-        off = theta - trace["theta_imposed_rad"] / pole_pairs
+        off = theta - trace["theta_imposed_rad"] / p
         fit = np.linalg.lstsq(np.stack(columns, axis=1), off, rcond=None)[0]
-        found.append(fit[1::2] - 1j * fit[2::2])
-    common, differs = np.abs(found[0] + found[1]) / 2.0, np.abs(found[0] - found[1]) / 2.0
-    noise = np.maximum(differs[:2], np.median(common[2:]))
-    clear = (common[:2] > PER_TURN_LEAST_RAD) & (common[:2] > PER_TURN_SURE * noise)
-    return float(common[0] * clear[0]), float(common[1] * clear[1])
+        found.append(fit[1::2] + 1j * fit[2::2])
+    common, differs = (found[0] + found[1]) / 2.0, np.abs(found[0] - found[1]) / 2.0
+    noise = np.maximum(differs, np.median(np.abs(common[len(ENCODER_ORDERS) :])))
+    return tuple(
+        Harmonic(order, float(of.real), float(of.imag), float(std))
+        for order, of, std in zip(ENCODER_ORDERS, common, noise, strict=False)
+    )
 
 
 def _slope(trace: Trace) -> float:

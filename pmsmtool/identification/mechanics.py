@@ -14,6 +14,7 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.cross_check import cross_check
+from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, total_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_instant_s
@@ -64,8 +65,10 @@ class Pushes:
         Torque (N m) of arrays of i_d, i_q (A).
     scale_std, tilt_std : float
         Relative standard deviations of its scale, and of what it is off at the fastest speed.
-    direction, pole_pairs : int
-        Sign of the encoder's count along the phase order, and pole pairs.
+    direction : int
+        Sign of the encoder's count along the phase order.
+    encoder : EncoderResult
+        Pole pairs, and the encoder's error once and twice per turn.
     tolerance : SensorTolerance or None
         Declared sensor tolerances.
     drag_std_nms : float
@@ -79,7 +82,7 @@ class Pushes:
     scale_std: float
     tilt_std: float
     direction: int
-    pole_pairs: int
+    encoder: EncoderResult
     tolerance: SensorTolerance | None
     drag_std_nms: float = 0.0
 
@@ -100,7 +103,8 @@ class Pushes:
             direction=self.direction,
             tolerance=self.tolerance,
             tilt_std=self.tilt_std,
-            pole_pairs=self.pole_pairs,
+            pole_pairs=round(self.encoder.pole_pairs.value),
+            encoder=self.encoder.per_turn,
             elastic=elastic,
         )
         return replace(found, B=replace(found.B, std=math.hypot(found.B.std, self.drag_std_nms)))
@@ -178,7 +182,7 @@ def pushes_of(
         torque_doubt(result.flux, doubt * displaced, mapped=result.flux_map is not None),
         math.hypot(TILT_FLOOR, tilt),
         direction,
-        pole_pairs,
+        result.encoder,
         tolerance,
         drag,
     )

@@ -12,7 +12,6 @@ from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS
 from pmsmtool.estimators.cross_check import CrossCheck
 from pmsmtool.estimators.estimate import Verdict, coverage_factor, statistical_half_width, total_half_width
 from pmsmtool.estimators.resistance import at_the_test
-from pmsmtool.estimators.shaft.mechanics import ENCODER_FALLBACK
 from pmsmtool.identification import flux_map, frequency_response
 from pmsmtool.identification.evaluate import NOTABLY_WIDER, Evaluation
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
@@ -106,7 +105,7 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
     if evaluation.encoder is not None:
         lines += [
             f"the encoder is off by {math.degrees(error):.2g} deg (mechanical) {often} per turn: mounted off centre? "
-            "J, B and tau_c suffer from it"
+            "It is taken out of J, B and tau_c"
             for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
             if error > 0.0
         ]
@@ -162,11 +161,14 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions[UNSEEN] = evaluation.unseen_hz
     if "mechanics" in request.measured and "J_kgm2" not in evaluation.estimates():
         conditions[INERTIA] = REFUSED
-    errors_rad = dict(evaluation.encoder_errors)
+    errors_rad: dict[int, float] = {}
+    if evaluation.encoder is not None:
+        errors_rad = {k: v for k, v in zip(ENCODER_ORDERS, evaluation.encoder.per_turn_rad, strict=False) if v > 0.0}
+    errors_rad |= evaluation.encoder_errors
     if evaluation.mechanics is not None:
         if evaluation.mechanics.drag is not None:
             conditions["drag_nms2"] = evaluation.mechanics.drag.value
-        if evaluation.mechanics.unexplained and evaluation.mechanics.J.fallback in ("", ENCODER_FALLBACK):
+        if evaluation.mechanics.unexplained and not evaluation.mechanics.J.fallback:
             conditions[TORQUE_NOISE] = evaluation.mechanics.ripple
         errors_rad |= {h.order: h.amplitude for h in evaluation.mechanics.harmonics.encoder_rad}
     often = dict(zip(ENCODER_ORDERS, ("once", "twice"), strict=True))

@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.angle_harmonics import AngleHarmonics, Harmonic
-from pmsmtool.estimators.encoder import PER_TURN_LEAST_RAD, PER_TURN_SURE, _per_turn
+from pmsmtool.estimators.encoder import PER_TURN_LEAST_RAD, PER_TURN_SURE, EncoderResult, _per_turn
 from pmsmtool.estimators.flux import map_fit
 from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
 from pmsmtool.estimators.inverter_error import InverterCurve
@@ -23,6 +23,7 @@ from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft import frequency_response as fr
 from pmsmtool.estimators.shaft import mechanics, response_lines, swing
 from pmsmtool.estimators.shaft.model import Run
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 from tests.estimators.traces import trace_of
 
@@ -125,7 +126,7 @@ def test_cogging_is_taken_along_with_the_inertia_of_the_fit_before(monkeypatch: 
     starts: list[list[float]] = []
 
     def blocks(run: Trace, *given: Any) -> tuple[Array, Run]:
-        assert given[-2] is cogging
+        assert given[-2].acceleration_rad_s2 is cogging.acceleration_rad_s2
         inertias.append(given[-1])
         return one.theta, one
 
@@ -223,7 +224,10 @@ def test_an_error_of_the_encoder_is_large_and_alike_in_both_directions(
         theta = np.arange(0.0, 2.0 * math.pi, 2.0 * math.pi / 720.0)
         off = size * np.cos(theta - 0.4) + sign * apart * np.cos(theta - 2.0) + 0.3 * size * np.sin(2.0 * theta)
         runs.append(trace_of(theta, theta_M_rad=theta, theta_imposed_rad=-5.0 * (theta - off)))
-    found = _per_turn(runs[0], runs[1], -5)
+    turned = _per_turn(runs[0], runs[1], -1, 5)
+    assert (turned[0].cosine, turned[0].sine) == pytest.approx((-size * math.cos(0.4), size * math.sin(0.4)), rel=1e-6)
+    assert turned[0].std == pytest.approx(apart, rel=1e-6, abs=1e-12)
+    found = EncoderResult(Estimate(5.0, 0.0, 0.0, "1"), -1, Estimate(0.0, 0.0, 0.0, "rad"), 0.0, turned).per_turn_rad
     assert found[0] == pytest.approx(size if clear else 0.0, rel=1e-6, abs=1e-12)
     assert found[1] == pytest.approx(0.3 * size if 0.3 * size > PER_TURN_LEAST_RAD else 0.0, rel=1e-6, abs=1e-12)
 
@@ -231,7 +235,8 @@ def test_an_error_of_the_encoder_is_large_and_alike_in_both_directions(
 def test_one_pole_pair_has_orders_to_compare_with_too() -> None:
     theta = np.arange(0.0, 2.0 * math.pi, 2.0 * math.pi / 720.0)
     run = trace_of(theta, theta_M_rad=theta, theta_imposed_rad=theta - 0.01 * np.cos(theta))
-    assert _per_turn(run, run, 1) == pytest.approx((0.01, 0.0), abs=1e-9)
+    once, twice = _per_turn(run, run, 1, 1)
+    assert (once.amplitude, twice.amplitude) == pytest.approx((0.01, 0.0), abs=1e-9)
 
 
 @pytest.mark.chain

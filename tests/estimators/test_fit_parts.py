@@ -16,7 +16,6 @@ from scipy.signal import lfilter
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.angle_harmonics import Harmonic
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, coverage_factor
 from pmsmtool.estimators.injection import axis_fit, sampling_instant
 from pmsmtool.estimators.injection.axis_fit import DISPERSION_PENALTY, LEAST_R, PENALTY
@@ -420,7 +419,6 @@ def test_friction_is_the_mean_of_models_with_and_without_drag(
     monkeypatch.setattr(mechanics, "_explained", lambda *_: (runs, with_drag, 2.0, runs))
     monkeypatch.setattr(mechanics, "_minimum", lambda *_: without)
     monkeypatch.setattr(mechanics, "require_useful", lambda *_: None)
-    monkeypatch.setattr(mechanics, "encoder_errors", lambda *_: (Harmonic(1, 0.0, 0.0, 0.0),))
     t = 1e-2 * np.arange(101.0)
     traces = [
         trace_of(t, {"coasting": k % 2 == 1}, theta_M_rad=0.01 * np.floor(1e2 * (t + t * t)), flagged=0.0 * t)

@@ -30,7 +30,7 @@ from pmsmtool.estimators.flux.map_rows import (
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.shaft import disturbances, mechanics, response_lines
 from pmsmtool.estimators.shaft import frequency_response as fr
-from pmsmtool.estimators.shaft.disturbances import ANGLE_STD, ELECTRICAL_STD, ENCODER_STD_RAD, Extent
+from pmsmtool.estimators.shaft.disturbances import ANGLE_STD, ELECTRICAL_STD, ENCODER_STD_RAD, UNKNOWN, Extent
 from pmsmtool.estimators.tracking import INFLATION_MAX, MINIMUM, NIS_GATE, NOISE_FLOOR, Track
 from pmsmtool.estimators.tracking_model import Known
 from pmsmtool.trace import Trace
@@ -254,11 +254,23 @@ def test_disturbances_are_shapes_of_the_angle_and_the_speed() -> None:
     back = disturbances.disturbances(-theta, torque, T, Extent(60.0, 0.8, 0.02), 1)
     assert back.torque.shape == (n, 13)  # once and twice per electrical turn are those of the shaft
     assert back.torque[:, 2] == pytest.approx(-back.torque[:, 1]) and np.all(back.torque[:20, 0] < 0.0)
-    errors = disturbances.encoder_errors(np.array([9.0, 1.0, 2.0, 3.0, 4.0]), (Harmonic(2, 0.1, 0.2, 0.3),))
-    assert [h.order for h in errors] == [1, 2] and (errors[1].cosine, errors[1].sine, errors[1].std) == pytest.approx(
-        (0.13, 0.24, 0.3)
+
+
+def test_an_encoder_s_error_is_fitted_about_what_a_slow_rotation_shows() -> None:
+    """By as much as that does not tell: product of two normal densities."""
+    turned = (Harmonic(1, 0.006, -0.002, 0.003), Harmonic(2, 0.001, 0.004, 0.0))
+    prior = disturbances.encoder_prior(turned, 5)
+    for h, seen in zip(prior, turned, strict=True):
+        weights = 1.0 / ENCODER_STD_RAD**2, 1.0 / (seen.std**2 + 0.002**2)  # 0.01 rad electrical
+        share = weights[1] / sum(weights)
+        assert (h.cosine, h.sine) == pytest.approx((share * seen.cosine, share * seen.sine))
+        assert h.std == pytest.approx(sum(weights) ** -0.5)
+    theta = np.linspace(0.0, 1.0, 9)
+    found = disturbances.disturbances(theta, np.ones(8), 0.1, Extent(1.0, 1.0, 0.0, prior), 5)
+    assert found.position[:, -4] == pytest.approx(prior[0].std * np.cos(theta), abs=1e-9)
+    assert (
+        tuple(disturbances.encoder_prior(turned, 2))[1] == UNKNOWN[1] and disturbances.encoder_prior((), 5) == UNKNOWN
     )
-    assert (errors[0].cosine, errors[0].sine, errors[0].std) == pytest.approx((0.01, 0.02, 0.0))
 
 
 # ---- records of a response --------------------------------------------------------------------------------------

@@ -13,17 +13,15 @@ interval is solved in closed form, with the instant of a reversal.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.angle_harmonics import LEAST_SPEED, AngleHarmonics, angle_harmonics
+from pmsmtool.estimators.angle_harmonics import LEAST_SPEED, AngleHarmonics, Harmonic, angle_harmonics
 from pmsmtool.estimators.estimate import (
     CHI2_WARN,
     COVERAGE_FACTOR,
@@ -35,7 +33,7 @@ from pmsmtool.estimators.estimate import (
 )
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt, linear_solve
 from pmsmtool.estimators.refusals import refuse
-from pmsmtool.estimators.shaft.disturbances import NONE, TILT_FLOOR, Extent, disturbances, encoder_errors
+from pmsmtool.estimators.shaft.disturbances import NONE, TILT_FLOOR, Extent, disturbances, encoder_prior
 from pmsmtool.estimators.shaft.model import SHAFT, Problem, Run, fastest, largest_torque, sizes_of, whitener
 from pmsmtool.estimators.shaft.position import encoder_step, position_noise, position_std
 from pmsmtool.machine.parameters import Estimate
@@ -85,10 +83,6 @@ machine has 0.0035 to 0.0039."""
 NOISY_TORQUE = "cogging, a load or a gear on the shaft, an elastic coupling, an encoder that is off centre"
 SCALE_FLOOR = 3e-4
 """Relative deviation of the torque's scale beyond that of flux linkage and displaced samples."""
-ENCODER_LEAST_RAD = 2e-3
-"""Error of the encoder from which on the fit is made again without it: at 1 degree with 6 pole pairs the first one has
-B 980 % off at +-46 %, the second 0.3 at +-2.5 %."""
-ENCODER_FALLBACK = "the encoder is off centre, which the fit takes out to the first order only"
 NO_HARMONICS = AngleHarmonics()
 MEAN_STD = 0.04
 """Relative standard deviation of the inertia by mean accelerations: six shafts with play were 0.1 to 1.6 % off."""
@@ -158,6 +152,7 @@ def estimate_mechanics(
     tolerance: SensorTolerance | None = None,
     tilt_std: float = TILT_FLOOR,
     pole_pairs: int = 1,
+    encoder: Sequence[Harmonic] = (),
     elastic: bool = False,
 ) -> MechanicsResult:
     """Estimate inertia and friction.
@@ -183,6 +178,8 @@ def estimate_mechanics(
         Relative standard deviation of the pushes' torque at their fastest speed, less at others.
     pole_pairs : int
         Of the machine: the current sensors' errors turn with the electrical angle.
+    encoder : sequence of Harmonic
+        Its error once and twice per turn along the phase order (rad), as a slow rotation shows it.
     elastic : bool
         Count any deviation of the torque as noise: the caller has another method to compare the inertia with.
 
@@ -201,12 +198,16 @@ def estimate_mechanics(
     step = encoder_step([run["theta_M_rad"] for run in runs])
     coasted = [(run.t_s, direction * run["theta_M_rad"]) for run in runs if run.meta["coasting"]]
     harmonics = angle_harmonics([(t_s, theta, position_std(theta, step)) for t_s, theta in coasted])
+    coasting = {h.order: h for h in harmonics.encoder_rad}
+    prior = [replace(coasting.get(h.order, h), std=h.std) for h in encoder_prior(encoder, pole_pairs)]
+    known = replace(harmonics, encoder_rad=tuple(prior))
 
-    def fitted(harmonics: AngleHarmonics, runs: Sequence[Trace]) -> Fitted:
+    def fitted(runs: Sequence[Trace]) -> Fitted:
         def blocks_of(J_kgm2: float) -> list[Run]:
-            given = (torque, abs(torque_per_a) * sigma_a, direction, pole_pairs, step, harmonics, J_kgm2)
+            given = (torque, abs(torque_per_a) * sigma_a, direction, pole_pairs, step, known, J_kgm2)
             found = [_blocks(run, *given) for run in runs]
-            extent = Extent(fastest([run for _, run in found]), largest_torque([run for _, run in found]), tilt_std)
+            sizes = fastest([run for _, run in found]), largest_torque([run for _, run in found])
+            extent = Extent(*sizes, tilt_std, prior)
             return [
                 replace(run, disturbances=disturbances(theta, run.torque, run.T, extent, pole_pairs))
                 for theta, run in found
@@ -221,20 +222,13 @@ def estimate_mechanics(
             blocks = blocks_of(math.exp(start[0]))
         return blocks, *_fit(blocks, start, elastic)
 
-    found = _explained(partial(fitted, harmonics), runs)
-    sizes = found[1].x[SHAFT + 1 : -2 * len(runs)]
-    note = ""
-    if max(h.amplitude for h in encoder_errors(sizes, ())) > ENCODER_LEAST_RAD:  # more than the shapes of a first order
-        note = ENCODER_FALLBACK
-        again = replace(harmonics, encoder_rad=encoder_errors(sizes, harmonics.encoder_rad))
-        with contextlib.suppress(IdentificationError):
-            centred = _explained(partial(fitted, again), runs)
-            if max(_noise(centred[3]).values()) <= max(_noise(found[3]).values()):
-                found, harmonics, note = centred, again, ""
-    blocks, with_drag, chi2, noisy = found
+    blocks, with_drag, chi2, noisy = _explained(fitted, runs)
     noise = _noise(noisy)
     unexplained = _unexplained(blocks, noisy)
-    without = _minimum(noisy, np.delete(with_drag.x, SHAFT), sizes_of(blocks))
+    # where the other parameters would lead without the drag: left as they are, they may be too far off for a fit
+    others, of_it = np.delete(with_drag.jacobian, SHAFT, axis=1), with_drag.jacobian[:, SHAFT] * with_drag.x[SHAFT]
+    start = np.delete(with_drag.x, SHAFT) + np.linalg.lstsq(others, of_it, rcond=None)[0]
+    without = _minimum(noisy, start, sizes_of(blocks))
     bound, condition = information_bound(without.jacobian)
     condition_gate(condition, "B and tau_c", STAGE, SEPARABLE)
     _, widen = chi2_gate(chi2, STAGE)
@@ -265,7 +259,7 @@ def estimate_mechanics(
     scale_std = math.hypot(scale_std, SCALE_FLOOR)
     estimates = [
         Estimate(value, math.hypot(std, scale_std * value), tolerance.inertia * abs(value), unit, n=n, chi2=chi2,
-                 method=METHOD, fallback=note)
+                 method=METHOD)
         for value, std, unit in zip((J, B, tau_c), stds, MEANS.values(), strict=True)
     ]  # fmt: skip
     ripple = max(noise.values())
