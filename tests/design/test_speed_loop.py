@@ -191,6 +191,8 @@ def test_the_modulus_margin_of_a_slow_loop_is_that_of_a_fine_grid(slower: float)
     loop = speed_loop(gains, path())
     fine = np.geomspace(1e-5, 1.0, 200_001) * math.pi / loop.T_s
     assert margins(loop).modulus_margin == pytest.approx(np.min(np.abs(1.0 + loop.at(fine))), rel=1e-7)
+    crossed = fine[np.abs(loop.at(fine)) >= 1.0][-1]
+    assert margins(loop).crossover_rad_s == pytest.approx(crossed, rel=1e-4)  # measured 6e-5, a step of the grid
 
 
 def elastic(zeta: float) -> SpeedPath:
