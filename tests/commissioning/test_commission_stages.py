@@ -288,22 +288,24 @@ def test_another_drive_is_refused(tmp_path: Path, drive: CanopenDrive) -> None:
     assert len(run.read().stages) == 1
 
 
-@pytest.mark.parametrize("share", [0.02, 0.4, 0.97])
 def test_ctrl_c_in_the_middle_leaves_old_or_new_and_goes_on(
-    share: float, tmp_path: Path, ended_once: Ended, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, ended_once: Ended, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A signal while a frame is awaited, at a share of all the frames that the chain takes."""
-    total = ended_once.frames
+    """Signals while a frame is awaited, one after the other in one run: twice in the writing, and in the proof.
+
+    Each comes after a share of all the frames that the chain takes; what had ended before is not done again.
+    """
     with drive_on(f"{PROFILE}?nv={tmp_path / 'second.nv'}") as second:
         run, crc = identified(tmp_path / "cut", second), active_crc(second)
-        with pytest.raises(Interrupted) as caught:
-            _frames(run, second, monkeypatch, int(share * total))
-        assert caught.value.exit_code == ExitCode.INTERRUPTED
-        assert is_safe(second.node.state())
-        after = active_crc(second)
-        assert after in (crc, crc32(image_of(read_parameter_set(run.path / "params.toml"))))
-        assert run.read().stages[-1].status == "interrupted"
-        finish(run, second)
+        for share, stage in ((0.02, "flash"), (0.4, "flash"), (0.97, "prove")):
+            with pytest.raises(Interrupted) as caught:
+                _frames(run, second, monkeypatch, int(share * ended_once.frames))
+            assert caught.value.exit_code == ExitCode.INTERRUPTED
+            assert is_safe(second.node.state())
+            assert active_crc(second) in (crc, crc32(image_of(read_parameter_set(run.path / "params.toml"))))
+            last = run.read().stages[-1]
+            assert (last.name, last.status) == (stage, "interrupted")
+        assert finish(run, second).ended == [("prove", "pass")]
 
 
 def _frames(
