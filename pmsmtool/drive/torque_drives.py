@@ -131,13 +131,9 @@ class SpeedPushDrive(TorqueDrive):
             raise NotAvailable("the drive has no current set-point, only a limit", where=f"node {self.node.node}")
         limit, speed = self.push.limit, self.push.speed
         self.node.put(limit.item, 0)
-        self.node.put(speed.item, math.floor(self.top_rad_s / speed.per_count) * _sign(i_q_a) if i_q_a else 0)
+        self.node.put(speed.item, math.copysign(math.floor(self.top_rad_s / speed.per_count), i_q_a) if i_q_a else 0)
         if i_q_a:
             self.node.put(limit.item, math.floor(abs(i_q_a) / limit.per_count))
-
-
-def _sign(value: float) -> int:
-    return 1 if value > 0.0 else -1
 
 
 def pushing_drive(connection: Connection, node_id: int, drive_map: DriveMap) -> TorqueDrive:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import motion_objects as motion
 from pmsmtool.drive import objects
@@ -302,6 +303,15 @@ def test_a_wait_lasts_as_long_as_it_is_asked_for(recording: bool, sends: bool) -
             began = clock.now()
             drive.wait(seconds)
             assert clock.now() - began == pytest.approx(seconds, abs=1e-3)
+
+
+@pytest.mark.parametrize(("code", "untuned"), [(AbortCode.VALUE, False), (AbortCode.DEVICE_STATE, True)])
+def test_a_mode_without_gains_is_told_from_one_that_is_not_there(code: int, untuned: bool) -> None:
+    with speed_loop() as (table, drive):
+        table.objects[0x6061, 0], table.fixed[0x6060, 0] = b"\0", code
+        with pytest.raises(NotAvailable, match="no mode of operation") as caught:
+            drive._set_mode(Mode.PROFILE_VELOCITY)
+        assert ("has no gains yet" in caught.value.likely) == untuned
 
 
 @pytest.mark.parametrize(("speed", "counts"), [(10.0, 20), (-10.2, -20), (10.3, 21), (0.24, 0), (-0.26, -1)])

@@ -24,6 +24,7 @@ from pmsmtool.errors import (
     SdoAbort,
     VerifyMismatch,
 )
+from pmsmtool.flash.download import NOTHING_WRITTEN
 from pmsmtool.flash.journal import MARKS, JournalFolder
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.sim.line import Frame
@@ -502,7 +503,10 @@ def test_drive_gone_keeps_the_journal_and_says_what_to_do(rig: Rig) -> None:
     rig.bench.wait(0.2)
     again = attach(rig.bench, rig.root)
     assert again.image() == before
+    holds = again.job(again.plan(SMALL), {}).holds
+    assert holds.startswith("nothing was written, and an earlier download was interrupted: ")
     again.download(SMALL)
+    assert again.job(again.plan(SMALL), {}).holds == NOTHING_WRITTEN
     finished = again.folder.last()
     assert finished is not None and finished.state == "done" and len(set(again.crcs())) == 1
 
