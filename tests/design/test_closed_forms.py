@@ -165,6 +165,17 @@ def test_overmodulation_costs_the_current_of_its_harmonics() -> None:
     assert facts["overmodulation_harmonic_apk"] == pytest.approx(flux / SURFACE.machine.L_d_h)
 
 
+def test_a_sag_costs_torque() -> None:
+    source = load_machine_file("interior-2k2")
+    V = source.inverter.V_max_v
+    rated, plane = ratings(source, V), at_temperature(source.machine, None)
+    facts = voltage_facts(source, rated, V)
+    for where, rpm in (("base_speed", rated.base_speed_rpm), ("n_max", rated.n_max_rpm)):
+        omega = rpm * math.pi / 30.0 * source.machine.pole_pairs
+        found = torque_limits(plane, [omega], [SAG_SHARE * V, V], rated.I_max_apk, rated.i_d_min_a).largest_nm[0]
+        assert facts[f"sag_torque_share_{where}"] == pytest.approx(found[0] / found[1])
+
+
 def test_an_interval_that_nobody_gave_says_why() -> None:
     box = tolerance_box(SURFACE)
     said = "; ".join(box.notes)

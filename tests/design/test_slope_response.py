@@ -215,10 +215,15 @@ def test_more_of_anything_is_a_larger_bound() -> None:
     assert bound(rate=1e6) == math.inf  # no bound is found: never a number that does not hold
 
 
-def test_an_unstable_loop_is_refused() -> None:
+def test_a_loop_that_is_unstable_or_hardly_settles_is_refused() -> None:
+    """A weak integral part leaves a pole at 1 - T_s K_i/(K_p + R)."""
     fast = replace(LOOPS, K_p=(2000.0, 2000.0))
-    with pytest.raises(DesignInfeasible, match="unstable"):
-        slope_response(BOX, fast, OMEGA, 5)
+    K_d, K_q = (5e-5 / T_S * (K_p + R) for K_p in LOOPS.K_p)
+    slow = replace(LOOPS, K_i=(K_d, K_q))
+    for loops in (fast, slow):
+        with pytest.raises(DesignInfeasible, match="unstable"):
+            slope_response(BOX, loops, OMEGA, 5)
+    slope_response(BOX, replace(LOOPS, K_i=(4.0 * K_d, 4.0 * K_q)), OMEGA, 5)
 
 
 def test_the_responses_are_of_the_kind_that_is_documented() -> None:
