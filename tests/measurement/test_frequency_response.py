@@ -215,6 +215,10 @@ def test_pushes_that_tell_another_inertia_are_believed_only_where_a_small_torque
     assert beside is not None and beside.inertia is None and not beside.found and "play" in beside.reason
     lighter, nowhere, doubted = of_no_rigid_shaft(Pushed(0.0150, 0.0), response)
     assert lighter is None and not nowhere and doubted is not None and doubted.inertia is None
+    _, means, missed = of_no_rigid_shaft(Swinging(0.0, 0.0120), replace(response, found={}))
+    mean = means["J_kgm2"]
+    assert mean.value == 0.0120 and mean.fallback.startswith(MEAN_FALLBACK) and "swings at 140 Hz" in mean.fallback
+    assert missed is not None and missed.inertia is None
     assert of_no_rigid_shaft(Pushed(0.0, 0.0), response) == (None, {}, response)
     none, means, kept = of_no_rigid_shaft(Pushed(0.0, 0.0165), response)
     assert none is None and kept is response and set(means) == {"B_nms", "tau_c_nm"}, "the response has the finer J"
