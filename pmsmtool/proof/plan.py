@@ -463,7 +463,8 @@ def _unreachable(s: _Sizes) -> Experiment | str:
     excitation = Excitation(Shape.STEP, Injection.I_Q, current, duration_s=rows * s.T_s)
     speed = omega / s.p / RPM
     text = f"i_q step to {current:.4g} A at {speed:.4g} rpm, for which the voltage does not suffice {when}"
-    return Experiment("unreachable", text, omega / s.p, excitation, rows, 1, scale_a=current)
+    return Experiment("unreachable", text, omega / s.p, excitation, rows, 1, scale_a=current,
+                      settle_s=SPEED_SETTLE / s.crossover_rad_s)  # fmt: skip
 
 
 def _back(levels: tuple[float, ...]) -> tuple[float, ...]:
