@@ -263,6 +263,7 @@ def reached(module: str, modules: Mapping[str, Collection[str]]) -> set[str]:
     return found
 
 
+@pytest.mark.chain
 def test_no_circle_between_rooms() -> None:
     assert circle(rooms(arrows())) == []
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": ()}) == ["b", "c"]

@@ -48,6 +48,7 @@ def copies(name: str, source: str) -> Iterator[str]:
                 yield f"{name}:{node.lineno}: a table of data types belongs to data_types.py"
 
 
+@pytest.mark.chain
 def test_nothing_in_the_package_is_a_copy() -> None:
     found = [
         copy

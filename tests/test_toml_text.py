@@ -24,6 +24,7 @@ def test_reads_back(tables):
     assert tomllib.loads(toml_text(tables)) == tables
 
 
+@pytest.mark.chain
 @given(st.lists(st.dictionaries(KEYS, PLAIN, min_size=1, max_size=3), min_size=1, max_size=3), PLAIN)
 def test_arrays_of_tables_read_back(rows, value):
     tables = {"row": rows, "after": {"value": value}}

@@ -94,6 +94,7 @@ def sentences(text: str) -> Iterator[str]:
     yield from re.split(r"(?<=[.;:?!])\s+|\n\s*\n|\n  - |  +", text)
 
 
+@pytest.mark.chain
 def test_a_message_has_no_sentence_that_is_too_long_and_no_optional_plural() -> None:
     for path in SOURCES:
         if path.relative_to(ROOT / "pmsmtool").parts[0] not in NO_SENTENCES:

@@ -55,6 +55,7 @@ def other_loop(path: AxisPath, gains: AxisGains) -> control.StateSpace:
     return other_plant(path.shaft, path.current) * control.ss(control.tf([1], [1, 0], T) * notch * law)
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("structure", ["cascade", "pid"])
 def test_loop_poles_and_margins_are_those_of_python_control(structure: Structure) -> None:
     path = AxisPath(SHAFT, CURRENT, 1, late=1, structure=structure, filter_hz=500.0)

@@ -226,6 +226,7 @@ def test_a_stop_whose_answers_begin_and_never_end_does_not_wait_for_them() -> No
     assert words[-1] == 0, "the voltage is taken away unheard"
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("greeting", [b"", b"<", b"< hi >", b"HTTP/1.1 400 Bad Request\r\n\r\n\x1b[2J"])
 def test_a_server_that_does_not_speak_socketcand_is_given_up(greeting: bytes) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:

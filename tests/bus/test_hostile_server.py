@@ -24,6 +24,7 @@ def test_commands_against_a_random_behaviour(seed: int, tmp_path: Path, monkeypa
     assert verdict.startswith("exit"), (verdict, seconds, text)
 
 
+@pytest.mark.chain
 def test_the_harness_sees_what_reaches_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path))
     good = dict.fromkeys(Nature.__dataclass_fields__, 0) | {

@@ -492,6 +492,7 @@ def test_trace_records_both_directions(tool: Tool, tmp_path: Path) -> None:
     assert {0x601, 0x581} <= ids
 
 
+@pytest.mark.chain
 def test_python_cans_own_configuration_decides(tmp_path: Path) -> None:
     environment = {
         **os.environ,

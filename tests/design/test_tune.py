@@ -161,6 +161,7 @@ def test_second_order_and_predictor_reach_the_parameters() -> None:
         tune(replace(SURFACE, inverter=InverterParameters(210.0, 12e3, delay_periods=0.5)), TuneRequest(predictor=True))
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize(
     ("f_s_hz", "delay", "controller", "predicts"),
     [(2400.0, 1.0, "pi", True), (2700.0, 1.5, "pi", False), (2400.0, 0.5, "pi", False), (2400.0, 1.5, "polar", False)],

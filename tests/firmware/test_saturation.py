@@ -137,6 +137,7 @@ def test_what_the_integrators_still_forget_does_not_move_an_unreachable_referenc
     assert settling_s(i, 0.29) < UNREACHABLE_S  # 2 % of the step; measured 9.3 ms
 
 
+@pytest.mark.chain
 def test_the_core_reports_the_torque_of_the_map() -> None:
     source = saturated()
     schedule = {"i_d_a": ((0.0, -10.0),), "i_q_a": ((0.0, 12.0),), "driven_rpm": ((0.0, 300.0),)}

@@ -127,6 +127,7 @@ NEAR = 1.08
 """Friction is found to some percent, and a speed is looked at every 12 ms; measured at most 1.06 of it."""
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize(("rate", "friction"), LIGHT_TO_HEAVY)
 def test_a_tool_that_dies_at_any_moment_leaves_a_shaft_within_the_speed(
@@ -147,6 +148,7 @@ def test_a_tool_that_dies_at_any_moment_leaves_a_shaft_within_the_speed(
     assert shaft.fastest > 10.0, "it is pushed all the same"
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("direction", [1, -1])
 @pytest.mark.parametrize(("rate", "friction"), LIGHT_TO_HEAVY)
 def test_recorded_pushes_keep_it_too(rate: float, friction: float, direction: int) -> None:

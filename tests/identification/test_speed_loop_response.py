@@ -63,6 +63,7 @@ def test_gains_over_inertia(a: float, b: float, filter_s: float, every: int, lat
     assert found.amps_per_rad_s2 == pytest.approx(AMPS_PER_RAD_S2, rel=0.03)
 
 
+@pytest.mark.chain
 def test_a_shaft_that_does_not_answer_gives_nothing() -> None:
     good = simulated(40.0, 320.0, 8e-4, 5, 5e-4, climbing(20.0, 8.0), 1)
     turning = StepRecord(good.t_s, 60.0 * good.t_s, np.zeros_like(good.t_s), good.references, good.segments, 1e-3, 0.01)

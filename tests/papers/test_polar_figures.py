@@ -56,6 +56,7 @@ def test_figure_is_within_its_ranges_and_prints_the_baselines(name: str) -> None
         assert {law.name for law in BASELINES} <= {name.split(":")[0] for name in printed}
 
 
+@pytest.mark.chain
 def test_a_wrong_law_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(polar_steps, "PROPOSED", CONVENTIONAL)
     found = {check.what: check.within for check in polar_steps.figure_3(0).checks}

@@ -42,6 +42,7 @@ START_A = 1e-3
 """How near the drive is to its initial current when the step comes; measured 2e-5 A."""
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("law", [BEST, replace(BEST, governor="paper", alpha=MODULUS_OPTIMUM), Law("back-calculation")])
 @pytest.mark.parametrize("condition", [NOMINAL, DELAYED, TABLE_2B])
 def test_the_compiled_loop_does_what_the_core_does_around_an_exact_plant(law: Law, condition: Condition) -> None:

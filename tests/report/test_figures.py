@@ -79,6 +79,7 @@ def test_the_fitted_response_is_measured_plus_residual(canvases: list[Any]) -> N
     assert predicted - measured == pytest.approx(sigma * residual[: len(measured)])
 
 
+@pytest.mark.chain
 def test_flux_shows_what_each_pair_is_off(canvases: list[Any]) -> None:
     w = np.repeat([-400.0, -300.0, -200.0, -150.0, 150.0, 200.0, 300.0, 400.0], 2)
     T, R, psi, L_d = 1e-4, 0.5, 0.2, 2e-3

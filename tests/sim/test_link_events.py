@@ -61,6 +61,7 @@ def test_a_chopper_holds_the_link_and_a_cut_supply_lets_it_fall() -> None:
         assert U[-1] == 567.0 if i_q < 0.0 else U[-1] < 400.0
 
 
+@pytest.mark.chain
 @pytest.mark.parametrize("event", EVENTS)
 @pytest.mark.parametrize("name", PROFILES)
 def test_the_link_stays_below_its_limit_at_the_largest_speed(name: str, event: str) -> None:

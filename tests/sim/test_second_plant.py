@@ -338,6 +338,7 @@ def test_it_refuses_a_flux_map() -> None:
         Simulation(setup, b"", keep)
 
 
+@pytest.mark.chain
 def test_a_saturating_machine_moves_as_its_closed_form_says() -> None:
     form, omega_e, u = BridgeSaturation(), 60.0 * POLE_PAIRS, 40.0 + 25.0j
 
