@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pmsmtool.estimators.injection.output_error import AxisModel, Pulses, respond
@@ -70,10 +70,15 @@ def _legs_ripple(u_d: float, u_q: float, i_d: float, i_q: float, sampling: Sampl
 @given(
     st.floats(-40.0, 40.0),
     st.floats(20.0, 140.0),
-    st.floats(-0.04, 0.15),
-    st.sampled_from([0.0, 0.05, 0.3, 1.0]),
+    st.floats(-0.25, 0.15),
+    st.sampled_from([0.0, 0.01, 0.05, 0.3, 1.0]),
 )
+@example(-30.0, 140.0, -0.16, 0.01)
 def test_ripple_is_that_of_the_switched_legs(u_d: float, u_q: float, instant: float, lag: float) -> None:
+    """An instant before the start, of an angle that is old, is one of the period before, whose pulses still last.
+
+    Taken for one after them, a lag of 1 % made 24 A of a ripple of 0.06 A, and a healthy machine had no psi.
+    """
     sampling = Sampling(instant * T_S, lag * T_S)
     voltage, current = (np.array([u_d]), np.array([u_q])), (np.array([4.0]), np.array([0.3]))
     found = sampled_ripple(voltage, current, MODULATION, sampling)[:, 0]

@@ -83,7 +83,7 @@ def sampled_ripple(
     edge = (1.0 - duties(v, modulation.U_dc_v)) * 0.5 * T_s
     on = edge + np.where(i > 0.0, modulation.dead_time_s, 0.0)
     off = T_s - edge + np.where(i < 0.0, modulation.dead_time_s, 0.0)
-    width, t = np.maximum(0.0, off - on), sampling.instant_s
+    width, t = np.maximum(0.0, off - on), sampling.instant_s % T_s  # before the start is late in the period before
     share = width / T_s
     mean = (0.5 * width**2 + width * (T_s - off)) / T_s - 0.5 * width
     conducted = np.clip(t - on, 0.0, width) - share * t - mean
@@ -97,8 +97,9 @@ def sampled_ripple(
 
 
 def _lagging(on: NDArray[np.float64], off: NDArray[np.float64], t: float, lag_s: float, T_s: float) -> Array:
-    """Periodic pulses of height 1 behind a first-order lag, at a time before the end of the first one."""
-    before = (np.exp(-(t + T_s - off) / lag_s) - np.exp(-(t + T_s - on) / lag_s)) / -math.expm1(-T_s / lag_s)
+    """Periodic pulses of height 1 behind a first-order lag, at a time within the period."""
+    ended = np.maximum(0.0, t + T_s - off)  # a pulse that fills the period ends late by the dead time
+    before = (np.exp(-ended / lag_s) - np.exp(-(t + T_s - on) / lag_s)) / -math.expm1(-T_s / lag_s)
     during = np.exp(-np.maximum(0.0, t - off) / lag_s) - np.exp(-np.maximum(0.0, t - on) / lag_s)
     return np.asarray(before + during)
 
