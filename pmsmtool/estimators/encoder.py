@@ -167,7 +167,8 @@ def _per_turn(forward: Trace, backward: Trace, direction: int, pole_pairs: int) 
     """Return what both directions show of the encoder's error once and twice per turn (rad mechanical).
 
     A rotor that sticks and slips behind the vector leaves something of every order: what does not stand out of the
-    others is not the encoder's. Multiples of the pole pairs are left out: offsets of the current sensors have them.
+    others is not the encoder's. Of multiples of the pole pairs nothing is known: offsets of the current sensors have
+    them.
     """
     p = pole_pairs
     orders = [*ENCODER_ORDERS, *(k for k in range(3, PER_TURN_ORDERS + 1) if p == 1 or k % p)]
@@ -181,7 +182,7 @@ def _per_turn(forward: Trace, backward: Trace, direction: int, pole_pairs: int) 
     common, differs = (found[0] + found[1]) / 2.0, np.abs(found[0] - found[1]) / 2.0
     noise = np.maximum(differs, np.median(np.abs(common[len(ENCODER_ORDERS) :])))
     return tuple(
-        Harmonic(order, float(of.real), float(of.imag), float(std))
+        Harmonic(order, float(of.real), float(of.imag), float(std) if order % p else math.inf)
         for order, of, std in zip(ENCODER_ORDERS, common, noise, strict=False)
     )
 

@@ -105,7 +105,7 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
     if evaluation.encoder is not None:
         lines += [
             f"the encoder is off by {math.degrees(error):.2g} deg (mechanical) {often} per turn: mounted off centre? "
-            "It is taken out of J, B and tau_c"
+            "J, B and tau_c of torque pulses are without it"
             for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
             if error > 0.0
         ]

@@ -237,6 +237,7 @@ def test_one_pole_pair_has_orders_to_compare_with_too() -> None:
     run = trace_of(theta, theta_M_rad=theta, theta_imposed_rad=theta - 0.01 * np.cos(theta))
     once, twice = _per_turn(run, run, 1, 1)
     assert (once.amplitude, twice.amplitude) == pytest.approx((0.01, 0.0), abs=1e-9)
+    assert once.std == twice.std == math.inf, "once per electrical turn: offsets of the current sensors have it, too"
 
 
 @pytest.mark.chain

@@ -79,13 +79,10 @@ class Extent:
 
 
 def encoder_prior(turned: Sequence[Harmonic], pole_pairs: int) -> Sequence[Harmonic]:
-    """Return the encoder's error (rad), order by order, with what a slow rotation ``turned`` showed of it.
-
-    Of the orders of the electrical turn it shows nothing: offsets and gains of the current sensors have them.
-    """
+    """Return the encoder's error (rad), order by order, with what a slow rotation ``turned`` showed of it."""
     prior = []
     for h in turned:
-        std = math.hypot(h.std, TURNED_STD_RAD / pole_pairs) if h.order % pole_pairs else math.inf
+        std = math.hypot(h.std, TURNED_STD_RAD / pole_pairs)
         share = ENCODER_STD_RAD**2 / (ENCODER_STD_RAD**2 + std**2)
         prior.append(Harmonic(h.order, share * h.cosine, share * h.sine, ENCODER_STD_RAD * math.sqrt(1.0 - share)))
     return prior or UNKNOWN
