@@ -60,7 +60,10 @@ _LIKELY: dict[int, tuple[str, str]] = {
     AbortCode.VALUE_HIGH: ("the value is above the drive's limit", "`pmsmtool param help NAME` shows the limits"),
     AbortCode.VALUE_LOW: ("the value is below the drive's limit", "`pmsmtool param help NAME` shows the limits"),
     AbortCode.VALUE: ("the value is outside what the drive accepts", "`pmsmtool param help NAME` shows the limits"),
-    AbortCode.DEVICE_STATE: ("the drive is enabled or in fault", "`pmsmtool stop`, then `pmsmtool fault show`"),
+    AbortCode.DEVICE_STATE: (
+        "the drive takes it in another state only: disabled, enabled, or without a fault",
+        "`pmsmtool stop`, then `pmsmtool fault show`",
+    ),
     AbortCode.RESOURCE: ("the drive is busy, it may store or start", "run the command again in a few seconds"),
     AbortCode.LOCAL_CONTROL: ("the drive is under local control", "release the panel or the vendor's software"),
     AbortCode.READ_ONLY: ("the object only reports", _MANUAL),

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
-from pmsmtool.cia402 import Mode, State
+from pmsmtool.cia402 import Command, Mode, State
 from pmsmtool.drive import objects, stop
 from pmsmtool.drive.drive_node import DriveNode, is_safe, state_text
 from pmsmtool.drive.parameters import DriveParameters
@@ -197,9 +197,12 @@ class CanopenDrive:
         if self._shown_mode() == mode:
             return
         try:
-            self.node.put(objects.MODE, mode)
+            self._ask_for_mode(mode)
         except SdoAbort as abort:
-            untuned = "the loop of this mode has no gains yet: `tune` and `flash-params` give it some"
+            untuned = (
+                "the loop of this mode has no gains yet: `tune` and `flash-params` give it some; or the drive takes a "
+                "mode in other states only"
+            )
             raise NotAvailable(
                 f"the drive has no mode of operation{_mode_name(mode)} ({int(mode)})",
                 where=f"node {self.node.node}, 0x6060:00",
@@ -212,6 +215,17 @@ class CanopenDrive:
             if clock.now() >= end:
                 raise self._other_mode(mode, shown, "the drive stays in")
             self.node.connection.wait(MODE_LOOK_S)
+
+    def _ask_for_mode(self, mode: int) -> None:
+        """Write a mode; some drives take it from READY TO SWITCH ON onwards, where there is no voltage yet."""
+        try:
+            self.node.put(objects.MODE, mode)
+        except SdoAbort as abort:
+            if abort.code != AbortCode.DEVICE_STATE or self.node.state() is not State.SWITCH_ON_DISABLED:
+                raise
+            self.node.go(Command.SHUTDOWN)
+            self.node.wait_for_state(lambda now: now is not State.SWITCH_ON_DISABLED)
+            self.node.put(objects.MODE, mode)
 
     def _other_mode(self, mode: int, shown: int, does: str) -> NotAvailable:
         return NotAvailable(

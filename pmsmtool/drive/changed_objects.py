@@ -28,6 +28,9 @@ _MARKS: tuple[_Object, ...] = tuple(
 )
 """Cleared by every change of another object."""
 FOLDER = "lent"
+_COMMANDS = frozenset({objects.MODE.index, 0x6071, 0x607A, 0x60FF})
+"""The mode a drive wakes up with, which some take from nobody, and targets, which some take only while enabled: the
+drive is off by now."""
 BUSY_S = 5.0
 """A drive that refuses because it is busy is asked again for so long."""
 
@@ -91,6 +94,7 @@ class ChangedObjects:
         changed = {n: data for n, data in parameters.items() if self._drive.parameters.read([n])[n] != data}
         self._sure |= {drive_map.address(name) for name in parameters.keys() - changed.keys()}
         lines: list[str] = []
+        busy: SdoAbort | None = None
         if changed:
             try:
                 self._drive.replace(changed)
@@ -112,11 +116,14 @@ class ChangedObjects:
                 else:
                     self._sure.add((index, sub))
             except SdoAbort as abort:
-                if index == objects.MODE.index:
-                    continue  # the mode a drive wakes up with, which some take from nobody; it is off by now
-                if is_busy(abort):
-                    raise
+                if index in _COMMANDS:
+                    continue
+                if is_busy(abort):  # the others get their content all the same
+                    busy = abort
+                    continue
                 lines.append(f"0x{index:04X}:{sub:02X}: {abort.what}")
+        if busy is not None:
+            raise busy
         if lines:
             raise VerifyMismatch(
                 "not everything could be restored",

@@ -15,6 +15,7 @@ import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.axis.design import AXIS_GAINS
+from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
@@ -94,9 +95,16 @@ class PositionDrive(TorqueDrive):
     # ---- motion ---------------------------------------------------------------------------------
 
     def enable(self) -> None:
-        """Bring the drive to operation enabled in its position mode, at the place where the shaft stands."""
+        """Bring the drive to operation enabled in its position mode, at the place where the shaft stands.
+
+        Some drives take a target only once enabled: they stay where they are until a set-point is announced.
+        """
         self._start_counts = self.node.get(POSITION)
-        self.node.put(TARGET_POSITION, self._start_counts)
+        try:
+            self.node.put(TARGET_POSITION, self._start_counts)
+        except SdoAbort as abort:
+            if abort.code != AbortCode.DEVICE_STATE:
+                raise
         self._energise(Mode.PROFILE_POSITION)
 
     def move_to(self, angle_rad: float, *, at_once: bool = False) -> None:

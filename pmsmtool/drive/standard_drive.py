@@ -206,8 +206,9 @@ class TorqueCurrent(CanopenDrive):
         return torque_target(self.node, self._rated_apk)
 
     def enable(self) -> None:
-        """Bring the drive to operation enabled at zero torque."""
-        self.node.put(self.target.quantity.item, 0)
+        """Bring the drive to operation enabled at zero torque; some drives take a target only from then on."""
+        if self.node.held(self.target.quantity.item) != 0.0:
+            self.node.put(self.target.quantity.item, 0)
         self._asked_a = 0.0
         if self.target.cyclic:
             self._step_s = max(STEP_S, cyclic_period_s(self.node, STEP_S))

@@ -256,7 +256,7 @@ def test_refusal_is_not_retried_and_says_what_to_do(
     with pytest.raises(SdoAbort) as refused:
         channel.download(*A, bytes(4))
     assert len(bus.sent) == 1
-    assert "node 5, 0x2010:02" in str(refused.value) and "enabled or in fault" in str(refused.value)
+    assert "node 5, 0x2010:02" in str(refused.value) and "in another state only" in str(refused.value)
     assert refused.value.exit_code == 4
 
 

@@ -367,7 +367,7 @@ def changed_of(node: DriveNode) -> ChangedObjects:
     return ChangedObjects(drive)
 
 
-A, B = DriveObject(0x6071, 0, "h"), DriveObject(0x60FF, 0, "i")
+A, B, LIMIT = DriveObject(0x6071, 0, "h"), DriveObject(0x60FF, 0, "i"), DriveObject(0x6073, 0, "H")
 LENT = Identity(NODE, 0xA51, 2, 3, 417, "", "", "")
 
 
@@ -443,14 +443,15 @@ def test_what_was_changed_comes_back_in_reverse_and_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("item", "named"), [(A, "0x6071:00: node refused"), (objects.MODE, "")]
+    ("item", "code", "named"),
+    [(LIMIT, 0x06090030, "0x6073:00: node refused"), (objects.MODE, 0x06090030, ""), (A, 0x08000022, "")],
 )  # fmt: skip
-def test_an_object_that_refuses_its_old_value_is_named_but_for_the_mode(item: DriveObject, named: str) -> None:
-    with node_of({A: 5, objects.MODE: 3}, GENERIC) as (table, node):
+def test_a_refused_old_value_is_named_but_of_mode_and_targets(item: DriveObject, code: int, named: str) -> None:
+    with node_of({A: 5, objects.MODE: 3, LIMIT: 5}, GENERIC) as (table, node):
         changed = changed_of(node)
         changed.begin()
         node.put(item, 9)
-        table.fixed[item.index, 0] = 0x06090030
+        table.fixed[item.index, 0] = code
         if not named:
             assert changed.restore() == 0
             return
@@ -489,21 +490,20 @@ def test_the_limits_come_back_where_a_parameter_does_not(error: Exception, told:
 
 @pytest.mark.parametrize(("code", "busy_s", "comes_back"), [(0x08000021, 4.5, True), (0x08000022, 9.0, False)])
 def test_a_busy_drive_is_asked_again_for_its_old_values(code: int, busy_s: float, comes_back: bool) -> None:
-    """It had been left with lowered limits where it was busy for an instant."""
-    with node_of({A: 5, B: 6}, GENERIC) as (table, node):
+    """It had been left with lowered limits where it was busy for an instant, or refused one object for its state."""
+    with node_of({A: 5, LIMIT: 6}, GENERIC) as (table, node):
         changed = changed_of(node)
         changed.begin()
         node.put(A, 50)
-        node.put(B, 60)
-        table.fixed[A.index, 0] = code
+        node.put(LIMIT, 60)
+        table.fixed[LIMIT.index, 0] = code
         table.bus.clock.after(busy_s, table.fixed.clear)
         if comes_back:
-            assert changed.restore() == 2 and (table.number(A), table.number(B)) == (5, 6)
-            assert busy_s < node.connection.clock.now() < busy_s + 0.2
+            assert changed.restore() == 2 and busy_s < node.connection.clock.now() < busy_s + 0.2
         else:
             with pytest.raises(SdoAbort):
                 changed.restore()
-            assert node.connection.clock.now() < 5.3 and table.number(B) == 6, "the others came back"
+            assert node.connection.clock.now() < 5.3 and table.number(A) == 5, "the others came back"
 
 
 def test_an_object_that_takes_its_old_value_and_does_not_keep_it() -> None:
