@@ -14,9 +14,8 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.command_table import COMMANDS, Row, Section
+from pmsmtool.cli.command_table import COMMANDS, Row, Section, leaves
 from pmsmtool.cli.failure import report
-from pmsmtool.cli.lazy_group import leaves
 from pmsmtool.cli.main import PROGRAM, cli
 from pmsmtool.errors import ConfigError
 

@@ -36,7 +36,7 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import IdentificationError, PmsmtoolError
 from pmsmtool.estimators.estimate import statistical_half_width, total_half_width
 from pmsmtool.estimators.shaft.mechanics import BLOCKS, TORQUE_FLOOR, estimate_mechanics
-from pmsmtool.estimators.shaft.motion import positions
+from pmsmtool.estimators.shaft.model import positions
 from pmsmtool.identification.evaluate import evaluate
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import dump_machine_file

@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""Reading TOML: the one reader behind every TOML file, so that each bad file ends in the same clear error."""
+"""TOML files: the one reader, so that each bad file ends in the same clear error; the one writer; lines of keys.
+
+Same tables, same bytes: keys in the order given, floats as the shortest text that reads back to the same number, no
+dates, no trailing blanks, LF line ends.
+"""
 
 from __future__ import annotations
 
+import re
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +20,16 @@ NEXT_STEP = "correct the text there; https://toml.io shows the format"
 
 LARGEST_WHOLE = 1 << 63
 """Whole numbers of TOML 1.0 have 64 bit; the standard library takes any, which no float holds."""
+
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+_LINE_LENGTH = 110
+"""Arrays longer than this are broken over lines."""
+
+_ESCAPES = {'"': '\\"', "\\": "\\\\", "\b": "\\b", "\t": "\\t", "\n": "\\n", "\f": "\\f", "\r": "\\r"}
+
+_TABLE_LINE = re.compile(r"\s*\[([^\[\]]+)\]")
+_KEY_LINE = re.compile(r"""\s*("[^"]*"|'[^']*'|[A-Za-z0-9_-]+)\s*=""")
+_NAME_PART = re.compile(r""""([^"]*)"|'([^']*)'|([A-Za-z0-9_-]+)""")
 
 
 @next_step(NEXT_STEP)
@@ -73,3 +88,146 @@ def _whole_numbers(value: Any, name: str) -> Iterator[tuple[str, int]]:
             yield from _whole_numbers(entry, name)
     elif isinstance(value, int) and not isinstance(value, bool):
         yield name, value
+
+
+def toml_text(tables: Mapping[str, Any], *, comment: str = "") -> str:
+    """Return the TOML document of nested tables.
+
+    Parameters
+    ----------
+    tables : mapping
+        Values are bool, int, float, str, a sequence of such, a mapping (a table) or a sequence of mappings
+        (an array of tables). A table's own values are written before its sub-tables.
+    comment : str
+        Written first, each line after ``# ``.
+
+    Raises
+    ------
+    TypeError
+        A value TOML has no form for (``None`` among them: leave the key out).
+    """
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
+    if lines:
+        lines.append("")
+    _write_table(lines, (), tables)
+    return "\n".join(lines).strip("\n") + "\n"
+
+
+def toml_value(value: Any) -> str:
+    """Return one value as TOML text."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
+        return str(int(value))
+    if isinstance(value, float):
+        return repr(float(value))
+    if isinstance(value, str):
+        return _string(value)
+    if isinstance(value, Sequence):
+        return _array(value)
+    raise TypeError(f"TOML has no form for {value!r}")
+
+
+def _string(text: str) -> str:
+    escaped = "".join(_ESCAPES.get(c, f"\\u{ord(c):04X}" if ord(c) < 0x20 or ord(c) == 0x7F else c) for c in text)
+    return f'"{escaped}"'
+
+
+def _array(values: Sequence[Any]) -> str:
+    items = [toml_value(item) for item in values]
+    flat = "[" + ", ".join(items) + "]"
+    if len(flat) <= _LINE_LENGTH and "\n" not in flat:
+        return flat
+    lines, line = [], ""
+    for item in items:
+        if line and len(line) + len(item) + 6 > _LINE_LENGTH:
+            lines.append(line)
+            line = ""
+        line += f"{item}, "
+    lines.append(line)
+    return "[\n" + "\n".join(f"    {text.rstrip()}" for text in lines) + "\n]"
+
+
+def _key(name: str) -> str:
+    return name if _BARE_KEY.fullmatch(name) else _string(name)
+
+
+def _is_tables(value: Any) -> bool:
+    return (
+        isinstance(value, Sequence)
+        and not isinstance(value, str)
+        and len(value) > 0
+        and all(isinstance(item, Mapping) for item in value)
+    )
+
+
+def _write_table(lines: list[str], path: tuple[str, ...], table: Mapping[str, Any]) -> None:
+    for name, value in table.items():
+        if not isinstance(value, Mapping) and not _is_tables(value):
+            lines.append(f"{_key(name)} = {toml_value(value)}")
+    for name, value in table.items():
+        below = (*path, name)
+        header = ".".join(_key(part) for part in below)
+        if isinstance(value, Mapping):
+            # a table that only holds tables needs no header of its own
+            if not value or any(not isinstance(v, Mapping) and not _is_tables(v) for v in value.values()):
+                lines.extend(["", f"[{header}]"])
+            _write_table(lines, below, value)
+        elif _is_tables(value):
+            for item in value:
+                lines.extend(["", f"[[{header}]]"])
+                _write_table(lines, below, item)
+
+
+_HEADER = re.compile(r"\s*\[{1,2}\s*([^\[\]#]+?)\s*\]{1,2}\s*(?:#.*)?")
+_ASSIGNMENT = re.compile(
+    r"""\s*((?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[A-Za-z0-9_-]+|"[^"]*"|'[^']*'))*)\s*="""
+)
+_PART = re.compile(r"""[A-Za-z0-9_-]+|"[^"]*"|'[^']*'""")
+
+
+def toml_lines(text: str) -> dict[tuple[str, ...], int]:
+    """Return the line of each table header and key of a TOML text, for messages about them.
+
+    Keys are paths (``("machine", "R_s_ohm")``). A line-by-line reading that ``tomllib`` does not offer: a line inside a
+    multi-line text that looks like a key may be listed too.
+    """
+    lines: dict[tuple[str, ...], int] = {}
+    table: tuple[str, ...] = ()
+    for number, line in enumerate(text.splitlines(), start=1):
+        if header := _HEADER.fullmatch(line):
+            table = _path(header[1])
+            lines.setdefault(table, number)
+        elif assignment := _ASSIGNMENT.match(line):
+            lines.setdefault((*table, *_path(assignment[1])), number)
+    return lines
+
+
+def _path(dotted: str) -> tuple[str, ...]:
+    return tuple(part.strip("\"'") for part in _PART.findall(dotted))
+
+
+def line_of(text: str, path: tuple[str, ...]) -> int:
+    """Return the line (from 1) of a key in a TOML text, or of the nearest table or row around it.
+
+    Both ways of writing a row are found: a table of its own, and ``"name" = { ... }``.
+    """
+    best, depth = 1, 0
+    table: tuple[str, ...] = ()
+    for number, line in enumerate(text.splitlines(), 1):
+        header, key = _TABLE_LINE.match(line), _KEY_LINE.match(line)
+        if header is not None:
+            table = _parts(header.group(1))
+            here = table
+        elif key is not None:
+            here = (*table, *_parts(key.group(1)))
+        else:
+            continue
+        common = len(here) if here == path[: len(here)] else 0
+        if common > depth:
+            best, depth = number, common
+    return best
+
+
+def _parts(text: str) -> tuple[str, ...]:
+    return tuple(next(filter(None, found), "") for found in _NAME_PART.findall(text))  # "" is a key, too

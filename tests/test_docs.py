@@ -19,9 +19,8 @@ import pytest
 import pmsmtool
 from benchmarks.command_reference import BEGIN, END, reference, replaced
 from benchmarks.recorded_sessions import arguments, session
-from pmsmtool.cli.command_table import COMMANDS
+from pmsmtool.cli.command_table import COMMANDS, leaves
 from pmsmtool.cli.help_topics import EXIT_CODES
-from pmsmtool.cli.lazy_group import leaves
 from pmsmtool.cli.main import cli
 from pmsmtool.errors import ConfigError, ExitCode
 from pmsmtool.machine.machine_keys import machine_file_keys

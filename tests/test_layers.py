@@ -34,7 +34,6 @@ FLOORS: dict[str, int] = {
     "resources": 2,
     "npz_file": 2,
     "toml_file": 2,
-    "toml_text": 2,
     "run_directory": 2,
     "machine": 3,
     "trace": 3,

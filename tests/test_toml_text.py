@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pmsmtool.toml_text import toml_lines, toml_text, toml_value
+from pmsmtool.toml_file import toml_lines, toml_text, toml_value
 
 KEYS = st.text(min_size=1, max_size=8)
 NUMBERS = st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False)

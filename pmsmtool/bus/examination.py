@@ -17,7 +17,7 @@ from can.interfaces import BACKENDS
 from pmsmtool.bus.connect import connect
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.frame_time import frame_bits
-from pmsmtool.bus.scan import FoundNode, find_nodes
+from pmsmtool.bus.nmt import FoundNode, find_nodes
 from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.errors import BusError, DriveTimeout, PmsmtoolError, SdoAbort
 

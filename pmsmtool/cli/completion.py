@@ -6,7 +6,7 @@ from __future__ import annotations
 import click
 from click.shell_completion import get_completion_class
 
-from pmsmtool.cli.lazy_group import COMPLETE_VARIABLE
+from pmsmtool.cli.command_table import COMPLETE_VARIABLE
 from pmsmtool.cli.options import examples
 from pmsmtool.errors import NotAvailable
 

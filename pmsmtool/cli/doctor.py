@@ -119,7 +119,7 @@ def _adapter_lines(found: list[Adapter], configured: dict[str, Any]) -> list[str
 
 def _set_up_lines(interface: str | None) -> list[str]:
     """Return what the adapter of an interface needs on this system; of all usual ones where none is named."""
-    from pmsmtool.bus.adapter_setup import ADAPTERS, how_to_set_up
+    from pmsmtool.bus.connect import ADAPTERS, how_to_set_up
 
     named = [interface] if interface in ADAPTERS else list(ADAPTERS)
     return ["to set up an adapter on this system:", *(f"  {how_to_set_up(str(each))}" for each in named)]

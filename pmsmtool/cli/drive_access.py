@@ -239,7 +239,7 @@ def choose_node(connection: Connection, node: int | None) -> int:
     ConfigError
         Several do, and none was named.
     """
-    from pmsmtool.bus.scan import find_nodes
+    from pmsmtool.bus.nmt import find_nodes
 
     if node is not None:
         return node

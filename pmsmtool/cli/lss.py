@@ -47,7 +47,7 @@ def scan_command(bus: BusOptions, out: Output) -> None:
 def set_command(bus: BusOptions, motion: MotionOptions, out: Output, new_id: int, store: bool) -> None:
     """Give the unconfigured node that is found a node id; refused when the id is taken."""
     from pmsmtool.bus.lss import LssMaster
-    from pmsmtool.bus.scan import find_nodes
+    from pmsmtool.bus.nmt import find_nodes
     from pmsmtool.cli.consent import ask_writing
     from pmsmtool.drive.drive_lock import claim_identity, claim_layer_setting
     from pmsmtool.errors import BusError, ConfigError

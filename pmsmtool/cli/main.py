@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from pmsmtool import __version__
+from pmsmtool.cli.command_table import COMPLETE_VARIABLE, LazyGroup
 from pmsmtool.cli.failure import report
-from pmsmtool.cli.lazy_group import COMPLETE_VARIABLE, LazyGroup
 from pmsmtool.cli.options import VERBOSITY, examples, global_options
 from pmsmtool.errors import ExitCode, decisive
 

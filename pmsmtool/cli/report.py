@@ -85,7 +85,7 @@ def report_command(
     if junit:
         from dataclasses import asdict
 
-        from pmsmtool.report.junit import junit_xml
+        from pmsmtool.report.verdict import junit_xml
         from pmsmtool.run_directory import RunDirectory
 
         write_file(path, junit_xml(asdict(RunDirectory(run).read()), found))

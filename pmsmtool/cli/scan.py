@@ -13,7 +13,7 @@ from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
     from pmsmtool.bus.connection import Connection
-    from pmsmtool.bus.scan import FoundNode
+    from pmsmtool.bus.nmt import FoundNode
 
 
 NODE_S = 5.0
@@ -28,7 +28,7 @@ def scan_command(bus: BusOptions, out: Output) -> None:
 
     Every node id is asked for its device type; nodes that only send heartbeats are listed too.
     """
-    from pmsmtool.bus.scan import find_nodes
+    from pmsmtool.bus.nmt import find_nodes
     from pmsmtool.errors import BusError
 
     with bus.connect() as connection:

@@ -50,7 +50,7 @@ def _whom(connection: Connection, node: int | None, everyone: bool) -> list[int]
     ConfigError
         Several do, and neither one nor all were asked for.
     """
-    from pmsmtool.bus.scan import find_nodes
+    from pmsmtool.bus.nmt import find_nodes
     from pmsmtool.cli.drive_access import choose_node
     from pmsmtool.drive.stop import nobody_confirms
     from pmsmtool.errors import BusError

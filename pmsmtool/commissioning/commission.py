@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
+from pmsmtool.commissioning.closed_stage import within_ratings
 from pmsmtool.commissioning.compared_stage import check_accepted, compared, refusal
 from pmsmtool.commissioning.contradiction import DATA_SHEET
 from pmsmtool.commissioning.level_stages import LevelStages
-from pmsmtool.commissioning.rated_limits import within_ratings
 from pmsmtool.commissioning.report_page import report_page
 from pmsmtool.design.lookup.design import LookupRequest
 from pmsmtool.design.loops.margins import MarginRequest
@@ -160,7 +160,7 @@ class Commissioning:
     require : tuple of str
         Stages without which the run fails; kept in its record, so that they hold when it is resumed.
     accept_limits : tuple of str
-        Limits of the design (:data:`~pmsmtool.commissioning.rated_limits.NAMES`) accepted below the machine's ratings.
+        Limits of the design (:data:`~pmsmtool.commissioning.closed_stage.NAMES`) accepted below the machine's ratings.
     """
 
     run: RunDirectory

@@ -32,8 +32,7 @@ from pmsmtool.drive.motion_objects import rated_apk
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive.torque_drives import TorqueDrive, pushing_drive
 from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, NotAvailable, SdoAbort
-from pmsmtool.experiments.first_push import WAY_RAD, push_forth_and_back
-from pmsmtool.experiments.first_turn import lead_half_a_turn
+from pmsmtool.experiments.first_turn import WAY_RAD, lead_half_a_turn, push_forth_and_back
 from pmsmtool.experiments.vector_turn import TURN_RAD, lead_onto_vector
 from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.identification.wiring import (

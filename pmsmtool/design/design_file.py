@@ -21,8 +21,7 @@ from pmsmtool.machine.profile import machine_path
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 from pmsmtool.plain_text import Summarised, Summary
-from pmsmtool.toml_file import parse_toml
-from pmsmtool.toml_text import toml_lines, toml_text
+from pmsmtool.toml_file import parse_toml, toml_lines, toml_text
 
 NEXT_STEP = "make the design again: `pmsmtool tune MACHINE -o design.toml`"
 

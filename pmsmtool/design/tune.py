@@ -36,7 +36,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.plausibility import implausible
+from pmsmtool.machine.parameters import implausible
 from pmsmtool.machine.speed_noise import quieter, speed_noise
 from pmsmtool.machine.two_masses import shafts_of, why_slower
 from pmsmtool.params.catalogue import CATALOGUE, FIELD_WEAKENING_MODES

@@ -22,9 +22,9 @@ from types import TracebackType
 from pmsmtool.bus.clock import Ticker
 from pmsmtool.bus.connection import SEND_PATIENCE_S, Connection
 from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE, NmtState
-from pmsmtool.drive.borrowed_pdo import BorrowedPdo
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.process_data import BorrowedPdo
 from pmsmtool.errors import BusError, NotAvailable, SdoAbort
 
 PERIOD_S = 0.05

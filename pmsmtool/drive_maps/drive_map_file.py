@@ -27,7 +27,6 @@ from pmsmtool.drive_maps.drive_map import (
 )
 from pmsmtool.drive_maps.identity_rows import TABLE as IDENTITY
 from pmsmtool.drive_maps.identity_rows import IdentityRows, dump_identity, parse_identity
-from pmsmtool.drive_maps.map_lines import line_of
 from pmsmtool.drive_maps.motion_objects import TABLE as MOTION
 from pmsmtool.drive_maps.motion_objects import dump_motion, parse_motion
 from pmsmtool.drive_maps.recorder_map import TABLE as RECORDER
@@ -37,8 +36,7 @@ from pmsmtool.drive_maps.wire_units import as_peak, counted_in, wire_unit
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.params.catalogue import BY_NAME, EVERY, Parameter
 from pmsmtool.params.parameter_set import TABLE_NAMES
-from pmsmtool.toml_file import parse_toml
-from pmsmtool.toml_text import toml_text
+from pmsmtool.toml_file import line_of, parse_toml, toml_text
 
 NEXT_STEP = "firmware-params/README.md says what each key of a map means; the maps beside it are examples"
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.arrays import Array
-from pmsmtool.axis.demand import trapezoid_of
+from pmsmtool.axis.reference import trapezoid_of
 from pmsmtool.drive.guard import GuardedDrive
 from pmsmtool.drive.position_drive import LARGEST, PositionDrive
 from pmsmtool.errors import DriveTimeout, NotAvailable

@@ -28,10 +28,10 @@ from pmsmtool.files import read_text
 from pmsmtool.identification.calibration import calibrated_traces
 from pmsmtool.identification.completed_machine import completed_machine
 from pmsmtool.identification.evaluate import tolerance_on
-from pmsmtool.identification.judgement import TOLD_BY, judged, stage_of
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method
 from pmsmtool.identification.run_files import MACHINE, place_of
 from pmsmtool.identification.supply_power import resistance_by_supply
+from pmsmtool.identification.value_verdict import TOLD_BY, judged, stage_of
 from pmsmtool.identification.wiring import judge_pulses
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters

@@ -19,8 +19,7 @@ from pmsmtool.estimators.least_squares import RELATIVE_STEP, linear_solve
 from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR, Extent, disturbances
 from pmsmtool.estimators.shaft.frequency_response import COHERENT
 from pmsmtool.estimators.shaft.mechanics import BLOCKS, SCALE_FLOOR
-from pmsmtool.estimators.shaft.model import SHAFT, Problem, Run, fastest, sizes_of, whitener
-from pmsmtool.estimators.shaft.motion import positions
+from pmsmtool.estimators.shaft.model import SHAFT, Problem, Run, fastest, positions, sizes_of, whitener
 from pmsmtool.estimators.shaft.position import position_std
 from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, HIGHEST_SHARE, LOWEST_HZ, ORDER
 from pmsmtool.trace import Trace

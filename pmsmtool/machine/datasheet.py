@@ -15,10 +15,9 @@ from decimal import Decimal
 from typing import Literal
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.datasheet_simulation import simulation_of
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
-from pmsmtool.machine.plausibility import implausible
+from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters, implausible
+from pmsmtool.machine.simulation_keys import simulation_of
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import RAD_S_PER_RPM, RPM_PER_RAD_S, format_quantity, parse_current

@@ -17,10 +17,9 @@ from typing import Any
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
 from pmsmtool.machine.flux_map import FluxMap
-from pmsmtool.machine.flux_map_table import flux_map_table
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_keys import MEASURABLE
-from pmsmtool.machine.machine_reader import MachineReader
+from pmsmtool.machine.machine_reader import MachineReader, flux_map_table
 from pmsmtool.machine.parameters import (
     EncoderParameters,
     Estimate,
@@ -31,8 +30,7 @@ from pmsmtool.machine.parameters import (
 from pmsmtool.machine.profile import NAMED, machine_path
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS, resolved_simulation
 from pmsmtool.plain_text import Summarised, Summary
-from pmsmtool.toml_file import parse_toml
-from pmsmtool.toml_text import toml_lines, toml_text
+from pmsmtool.toml_file import parse_toml, toml_lines, toml_text
 
 NEXT_STEP = "`pmsmtool help machine-file` lists the keys; `pmsmtool machine new` writes a file from a data sheet"
 

@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from pmsmtool.errors import ConfigError
-from pmsmtool.machine.flux_map import FluxMap, require_monotonic
-from pmsmtool.machine.flux_map_table import flux_map_from_table
+import numpy as np
+from numpy.typing import NDArray
+
+from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.machine.flux_map import INVERSE_NODES, FluxMap, meta_json, require_monotonic
 from pmsmtool.machine.key import Key, check_table, did_you_mean
 from pmsmtool.machine.machine_keys import (
     ENCODER_KEYS,
@@ -47,6 +50,11 @@ ELSEWHERE = {key.name: table for table in ("limits", "encoder", "inverter", "mac
 
 OVERMODULATION_NEEDS = ("min_off_time_s", "sample_window_s", "shunts")
 """Keys of ``[inverter]`` without which no voltage is beyond the linear range."""
+
+NEXT_STEP = "make the file again from the machine file: the map in it was edited"
+
+_GRIDS = ("i_d_a", "i_q_a", "psi_d_wb", "psi_q_wb")
+_KEYS = (*_GRIDS, "kind", "inverse_nodes", "meta")
 
 
 class MachineReader:
@@ -260,3 +268,42 @@ def _map_file(file: str, folder: Path | None) -> FluxMap:
     if folder is None:
         raise ConfigError("names a file, but these tables have no folder; embed the map")
     return load_flux_map(folder / file)
+
+
+def flux_map_table(flux_map: FluxMap) -> dict[str, Any]:
+    """Return the table: axes (A peak), ``psi_d_wb[i_d][i_q]``, kind, inverse nodes, metadata as JSON text."""
+    table: dict[str, Any] = {"kind": flux_map.kind, "inverse_nodes": list(flux_map.inverse_nodes)}
+    if flux_map.meta:
+        table["meta"] = meta_json(flux_map)
+    return {**table, **{name: getattr(flux_map, name).tolist() for name in _GRIDS}}
+
+
+@next_step(NEXT_STEP)
+def flux_map_from_table(table: Any) -> FluxMap:
+    """Return the map of a table.
+
+    Raises
+    ------
+    ConfigError
+        A key is missing, unknown or not of numbers, or the grids are no map.
+    """
+    if not isinstance(table, Mapping):
+        raise ConfigError("is not a table")
+    unknown = [f"unknown key {name}{did_you_mean(name, _KEYS)}" for name in table if name not in _KEYS]
+    missing = [f"{name} is missing" for name in _GRIDS if name not in table]
+    if unknown or missing:
+        raise ConfigError("is not a flux map", violations=[*unknown, *missing])
+    try:
+        i_d, i_q, psi_d, psi_q = (_numbers(table[name], name) for name in _GRIDS)
+        first, second = (int(n) for n in table.get("inverse_nodes", INVERSE_NODES))
+        meta = dict(json.loads(table.get("meta", "{}")))
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"holds something that is not a number or not JSON ({error})") from None
+    return FluxMap(i_d, i_q, psi_d, psi_q, table.get("kind", "bicubic"), (first, second), meta)
+
+
+def _numbers(values: Any, name: str) -> NDArray[np.float64]:
+    array = np.asarray(values)
+    if array.dtype.kind not in "fi":
+        raise ValueError(f"{name} is not an array of numbers")
+    return np.asarray(array, dtype=np.float64)

@@ -25,8 +25,14 @@ from pmsmtool.drive.torque_drives import SpeedPushDrive, TorqueDrive, pushing_dr
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.experiments.current_limit import LimitShown, require_limit, show_torque_limit, unproven
-from pmsmtool.experiments.polled_push import PolledPushPlan, coast_both_ways, push_both_ways, run_to_voltage
-from pmsmtool.experiments.recorded_push import PushPlan, swing
+from pmsmtool.experiments.polled_push import (
+    PolledPushPlan,
+    PushPlan,
+    coast_both_ways,
+    push_both_ways,
+    run_to_voltage,
+    swing,
+)
 from pmsmtool.experiments.rotation import STEP_RAD, RotationPlan, dwell_within, rotate_vector
 from pmsmtool.experiments.shaft_answer import ShaftAnswer
 from pmsmtool.experiments.supply_levels import LEVELS, hold_supply_levels

@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.packaging import wheel
-from pmsmtool.packaging.build_kernels import build_all
+from pmsmtool.packaging.build_kernels import build_all, build_page_module
 from pmsmtool.packaging.compiler import Compiler, build_compiler, system_compiler
 from pmsmtool.packaging.kernels import here, local_wheel_tag
-from pmsmtool.packaging.page_module import build_page_module
 
 Settings = Mapping[str, Any] | None
 

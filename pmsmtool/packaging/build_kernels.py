@@ -1,19 +1,43 @@
 # SPDX-License-Identifier: MIT
-"""Compile the kernels of a checkout: ``python -m pmsmtool.packaging.build_kernels``."""
+"""Compile the kernels of a checkout: ``python -m pmsmtool.packaging.build_kernels``, and the module of a report's page.
+
+The page's WebAssembly module has the sources of the kernel ``pmsm_sim``, by the pinned ziglang alone: compilers of this
+machine make none. Where ziglang is missing, an installation has no module and its reports say so. The module imports
+nothing, so that a page runs it without a network and without a C library.
+"""
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from pmsmtool.native import LIBRARY_FOLDER, library_name
-from pmsmtool.packaging.compiler import Compiler, CompilerError, build_compiler, compile_library
-from pmsmtool.packaging.kernels import KERNELS, Kernel, is_current
-from pmsmtool.packaging.page_module import SOURCES, build_page_module
+from pmsmtool.native import LIBRARY_FOLDER, PAGE_MODULE, library_name
+from pmsmtool.packaging.compiler import (
+    Compiler,
+    CompilerError,
+    build_compiler,
+    compile_library,
+    run_compiler,
+    zig_compiler,
+)
+from pmsmtool.packaging.kernels import COMPILE_FLAGS, INCLUDE_FOLDERS, KERNELS, SIMULATION, Kernel, Target, is_current
 
 PACKAGE = Path(__file__).resolve().parent.parent
+
+PAGE_SOURCES = Kernel("pmsm_page", SIMULATION, without=("sim/monte_carlo.c",))
+"""Without the threads of the Monte Carlo run: a page has none."""
+EXPORTS = (
+    "pmsm_drive_size", "pmsm_drive_init", "pmsm_drive_load", "pmsm_sim_layout", "pmsm_sim_part", "pmsm_sim_start",
+    "pmsm_sim_run", "pmsm_sim_set_schedule", "pmsm_sim_set_record", "__heap_base",
+)  # fmt: skip
+"""What the page's script calls, and where memory is free."""
+_TARGET = Target("WebAssembly", "wasm", "wasm32", "wasm32-freestanding", "")
+_HEADERS = ("wasm-wasi-musl", "generic-musl")
+"""Headers that ziglang carries: of ``math.h`` and ``string.h`` only what the compiler itself does is used."""
 
 
 def build_all(
@@ -46,7 +70,7 @@ def build_all(
 
 def main(argv: list[str] | None = None) -> int:
     """Build into ``pmsmtool/_native``; warnings are errors; one kernel's errors do not keep the others back."""
-    names = [kernel.name for kernel in (*KERNELS, SOURCES)]
+    names = [kernel.name for kernel in (*KERNELS, PAGE_SOURCES)]
     parser = argparse.ArgumentParser(description="Compile the kernels of this checkout into pmsmtool/_native.")
     parser.add_argument("kernel", nargs="*", help=f"which ones; default all of {', '.join(names)}")
     parser.add_argument("--force", action="store_true", help="compile also what is up to date")
@@ -60,10 +84,44 @@ def main(argv: list[str] | None = None) -> int:
         except CompilerError as error:
             print(error, file=sys.stderr)
             failed = 1
-    if not options.kernel or SOURCES.name in options.kernel:
+    if not options.kernel or PAGE_SOURCES.name in options.kernel:
         build_page_module(PACKAGE, LIBRARY_FOLDER, force=options.force)
     return failed
 
 
 if __name__ == "__main__":
     sys.exit(main())
+
+
+def build_page_module(package: Path, folder: Path, *, strict: bool = False, force: bool = False) -> list[Path]:
+    """Compile the module into ``folder`` and return it in a list.
+
+    Where ziglang is missing or refuses, the list is empty and the reason is printed; with ``strict`` it is raised.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    module = folder / PAGE_MODULE
+    if not force and is_current(module, PAGE_SOURCES, package):
+        return [module]
+    try:
+        _compile(package, module)
+    except CompilerError as error:
+        if strict:
+            raise
+        print(f"{module.name}: not built, reports do not recompute themselves: {error}", file=sys.stderr)
+        return []
+    return [module]
+
+
+def _compile(package: Path, module: Path) -> None:
+    compiler = zig_compiler(_TARGET)
+    headers = Path(compiler.command[0]).parent / "lib" / "libc" / "include"
+    arguments = [*COMPILE_FLAGS, "-O2", "-nostdlib", "-Wl,--no-entry"]
+    arguments += [f"-Wl,--export={name}" for name in EXPORTS]
+    arguments += [part for name in _HEADERS for part in ("-isystem", str(headers / name))]
+    arguments += [part for name in INCLUDE_FOLDERS for part in ("-iquote", name)]
+    arguments += [path.as_posix() for path in PAGE_SOURCES.source_files(package)]
+    with tempfile.TemporaryDirectory(dir=module.parent, prefix=".build-") as scratch:
+        output = Path(scratch) / module.name
+        run_compiler(compiler, [*arguments, "-o", str(output)], package, f"{compiler.name}: {module.name}")
+        os.replace(output, module)
+    print(f"{module.name}: compiled by {compiler.name}", file=sys.stderr)

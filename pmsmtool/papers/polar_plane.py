@@ -21,8 +21,7 @@ from pmsmtool.design.polar import (
     phase_plant,
     place_pid,
 )
-from pmsmtool.design.polar_map import (
-    RPM,
+from pmsmtool.design.polar_values import (
     ScheduledGains,
     condition_map,
     controllable,
@@ -33,6 +32,7 @@ from pmsmtool.design.polar_map import (
 )
 from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, at_most, near
 from pmsmtool.papers.polar_scene import ASSUMED, EXPECTED, K_T, PEAK, SOURCE, V_MAX, machine_file
+from pmsmtool.units import RAD_S_PER_RPM
 
 SPEEDS_RPM = np.linspace(0.0, 1400.0, 281)
 TORQUES_NM = np.linspace(-5.0, 5.0, 201)
@@ -47,7 +47,7 @@ V_PEAK = V_MAX * PEAK
 
 
 def _omega(rpm: float) -> float:
-    return rpm * RPM * machine().pole_pairs
+    return rpm * RAD_S_PER_RPM * machine().pole_pairs
 
 
 # ---- equilibria ----------------------------------------------------------------------------------------------

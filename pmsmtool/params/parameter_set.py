@@ -22,8 +22,7 @@ from typing import Any
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY, LUT_CAPACITY_WORDS, SATURATION_VALUES
-from pmsmtool.toml_file import parse_toml
-from pmsmtool.toml_text import toml_text
+from pmsmtool.toml_file import parse_toml, toml_text
 
 NEXT_STEP = (
     "`pmsmtool tune` and `pmsmtool export` write such a file; `pmsmtool param help NAME` shows a parameter's bounds"

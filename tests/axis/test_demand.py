@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pmsmtool.axis.demand import trapezoid_of
-from pmsmtool.axis.reference import Profile, plan
+from pmsmtool.axis.reference import Profile, plan, trapezoid_of
 
 SPEED_WITHIN, RAMP_WITHIN = 0.015, 0.02
 """Relative; measured 1.0 % both."""

@@ -12,8 +12,7 @@ import pytest
 
 from pmsmtool.axis.design import PID, AxisGains, AxisRequest, axis_path, from_pid, profile_within, with_axis
 from pmsmtool.axis.loops import lifted
-from pmsmtool.axis.robustness import axis_margins
-from pmsmtool.axis.search import Box, Limits, stiffest
+from pmsmtool.axis.search import Box, Limits, axis_margins, stiffest
 from pmsmtool.commissioning.axis_design import (
     GROUPS,
     _slowed,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.axis.loops import AxisGains, AxisPath, Loop, Structure, closed_loop_poles, lifted, open_loop
-from pmsmtool.axis.robustness import axis_margins
+from pmsmtool.axis.search import axis_margins
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import Notch, SpeedGains, SpeedMethod, SpeedPath, notch_coefficients, speed_loop

@@ -25,8 +25,7 @@ import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 
 from pmsmtool.bus.connect import Connection
-from pmsmtool.bus.nmt import NmtCommand, reset_node, send_nmt
-from pmsmtool.bus.scan import find_nodes
+from pmsmtool.bus.nmt import NmtCommand, find_nodes, reset_node, send_nmt
 from pmsmtool.bus.sdo import Mode, SdoChannel
 from pmsmtool.errors import DriveTimeout, SdoAbort
 

@@ -16,7 +16,7 @@ from benchmarks.random_drives import draw_drive
 from pmsmtool.commissioning.first_check_levels import beyond, judge_kept
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import LimitExceeded
-from pmsmtool.experiments.first_push import WAY_RAD, push_forth_and_back
+from pmsmtool.experiments.first_turn import WAY_RAD, push_forth_and_back
 from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG, judge_current, judge_pulses, judge_push
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path

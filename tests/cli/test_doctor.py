@@ -12,8 +12,7 @@ import can
 import pytest
 from click.testing import CliRunner
 
-from pmsmtool.bus.adapter_setup import ADAPTERS, how_to_set_up, meant_interface
-from pmsmtool.bus.connect import in_time
+from pmsmtool.bus.connect import ADAPTERS, how_to_set_up, in_time, meant_interface
 from pmsmtool.bus.examination import _heard, adapters
 from pmsmtool.cli import doctor
 from pmsmtool.cli.main import cli

@@ -455,7 +455,7 @@ def test_stop_that_reaches_no_drive_is_exit_8(
     tool: Tool, monkeypatch: pytest.MonkeyPatch, whom: tuple[str, ...]
 ) -> None:
     """Exit code 3 only where no adapter opened: here it did."""
-    monkeypatch.setattr("pmsmtool.bus.scan.find_nodes", lambda connection: [])
+    monkeypatch.setattr("pmsmtool.bus.nmt.find_nodes", lambda connection: [])
     code, _, err = tool(*whom)
     assert code == 8 and "STOP NOT CONFIRMED" in err and "hardware stop" in err
 

@@ -16,7 +16,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from pmsmtool.cli import command_table, failure, lazy_group, main, options
+from pmsmtool.cli import command_table, failure, main, options
 from pmsmtool.cli.help_topics import EXIT_CODES, TOPICS
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import (
@@ -86,7 +86,7 @@ def test_linear_algebra_has_one_thread_whatever_the_processors() -> None:
 
 
 def test_help_lists_every_command_under_its_section_without_importing_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lazy_group, "load_command", lambda row: pytest.fail(f"imported {row.name}"))
+    monkeypatch.setattr(command_table, "load_command", lambda row: pytest.fail(f"imported {row.name}"))
     text = CliRunner().invoke(main.cli, ["--help"]).output
     for section in command_table.Section:
         rows = [row for row in command_table.COMMANDS if row.section is section]
@@ -105,7 +105,7 @@ def test_no_arguments_prints_help_and_is_a_usage_error() -> None:
 
 @pytest.mark.parametrize("row", command_table.COMMANDS, ids=lambda row: row.name)
 def test_row_names_a_command(row: command_table.Row) -> None:
-    command = lazy_group.load_command(row)
+    command = command_table.load_command(row)
     assert isinstance(command, click.Command)
     assert command.name == row.name
     assert re.fullmatch(r"[a-z]+(-[a-z]+)*", row.name)
@@ -114,7 +114,7 @@ def test_row_names_a_command(row: command_table.Row) -> None:
     assert row.target.startswith("pmsmtool.cli.")
 
 
-@pytest.mark.parametrize(("typed", "command"), list(lazy_group.leaves()), ids=str)
+@pytest.mark.parametrize(("typed", "command"), list(command_table.leaves()), ids=str)
 def test_every_command_explains_itself(typed: str, command: click.Command) -> None:
     assert command.help, f"{typed} has no help"
     assert command.epilog, f"{typed} shows no examples"
@@ -133,7 +133,6 @@ def test_modules_of_commands_are_all_registered() -> None:
         "command_table",
         "consent",
         "failure",
-        "lazy_group",
         "main",
         "options",
         "output",
@@ -173,8 +172,8 @@ def exit_code(action: Callable[[], object], monkeypatch: pytest.MonkeyPatch, *ar
         action()
 
     row = command_table.Row("probe", "pmsmtool.cli.nowhere:command", command_table.Section.LOOK, "Probe.")
-    monkeypatch.setattr(lazy_group, "COMMANDS", (row,))
-    monkeypatch.setattr(lazy_group, "load_command", lambda _: command)
+    monkeypatch.setattr(command_table, "COMMANDS", (row,))
+    monkeypatch.setattr(command_table, "load_command", lambda _: command)
     return main.run([*arguments, "probe"])
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from pmsmtool.arrays import Array
-from pmsmtool.axis.demand import trapezoid_of
 from pmsmtool.axis.design import PID
+from pmsmtool.axis.reference import trapezoid_of
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.trace import Trace

@@ -30,8 +30,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.identification.value_verdict import value_facts
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.report.junit import junit_xml
-from pmsmtool.report.verdict import Verdict
+from pmsmtool.report.verdict import Verdict, junit_xml
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage, new_record
 from pmsmtool.trace import Trace

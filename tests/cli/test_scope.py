@@ -20,7 +20,7 @@ import pytest
 
 from benchmarks.live_page import looks
 from pmsmtool.cli import live_server, scope
-from pmsmtool.cli.lazy_group import load_command
+from pmsmtool.cli.command_table import load_command
 from pmsmtool.cli.live_server import MOST_CONNECTIONS, MOST_NUMBERS, MOST_ROWS, LiveServer, Samples
 from pmsmtool.commissioning.printed_page import find_browser
 from pmsmtool.errors import ConfigError

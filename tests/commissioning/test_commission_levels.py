@@ -18,10 +18,9 @@ from click.testing import CliRunner
 
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
-from pmsmtool.commissioning.closed_stage import LIMITS, NO_BANDWIDTH, NO_INERTIA, why_no_limits
+from pmsmtool.commissioning.closed_stage import LIMITS, NAMES, NO_BANDWIDTH, NO_INERTIA, why_no_limits
 from pmsmtool.commissioning.commission import Commissioning, begin_run, due_stages
 from pmsmtool.commissioning.level_stages import NO_STEPS, LevelStages
-from pmsmtool.commissioning.rated_limits import NAMES
 from pmsmtool.commissioning.report_page import NO_DATA_SHEET, report_page, verdict
 from pmsmtool.design.closed_drive import RATED, SLOPE, SPEED, TORQUE
 from pmsmtool.design.design_file import load_design

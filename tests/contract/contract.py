@@ -20,8 +20,7 @@ import pytest
 
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import Connection
-from pmsmtool.bus.nmt import NmtCommand, NmtState, reset_node, send_nmt
-from pmsmtool.bus.scan import find_nodes
+from pmsmtool.bus.nmt import NmtCommand, NmtState, find_nodes, reset_node, send_nmt
 from pmsmtool.bus.sdo import Mode, SdoChannel
 from pmsmtool.errors import DriveTimeout, PmsmtoolError, SdoAbort
 from pmsmtool.firmware.image import crc32

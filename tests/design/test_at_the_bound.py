@@ -29,8 +29,7 @@ from pmsmtool.design.loops.open_loops import CURRENT_GAINS, smaller_gains
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import pole_placement, symmetric_optimum
 from pmsmtool.design.operating_machine import OperatingMachine
-from pmsmtool.design.polar_map import share_above
-from pmsmtool.design.polar_values import _facts, _options
+from pmsmtool.design.polar_values import _facts, _options, share_above
 from pmsmtool.design.ratings import Ratings, ratings
 from pmsmtool.design.tune import NOTCH_RATE_SHARE, _notch, tune
 from pmsmtool.design.tune_request import TuneRequest

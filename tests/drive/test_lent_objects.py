@@ -16,7 +16,6 @@ import pytest
 from pmsmtool.bus.nmt import NmtState
 from pmsmtool.drive import heartbeat as beating
 from pmsmtool.drive import objects
-from pmsmtool.drive.borrowed_pdo import BorrowedPdo
 from pmsmtool.drive.changed_objects import ChangedObjects, any_lent, restore_lent
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
@@ -26,7 +25,7 @@ from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.own_limits import LEAST_COUNTS, lower_limits, put_limit
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Identity
-from pmsmtool.drive.process_data import LiveValues, live_values, sent_every_s
+from pmsmtool.drive.process_data import BorrowedPdo, LiveValues, live_values, sent_every_s
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import BusError, DriveFault, NotAvailable, SafetyRefusal, SdoAbort, VerifyMismatch

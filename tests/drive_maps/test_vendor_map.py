@@ -18,7 +18,7 @@ from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.drive_maps.wire_units import counted_in
 from pmsmtool.errors import ConfigError
 from pmsmtool.resources import data_folder
-from pmsmtool.toml_text import toml_text
+from pmsmtool.toml_file import toml_text
 
 HEAD = """\
 schema = "pmsmtool.drive-map/1"

@@ -37,8 +37,7 @@ from pmsmtool.estimators.resistance import Copper, copper_of, resistance_warmed
 from pmsmtool.estimators.sensor_mismatch import LEAST, SURE, SensorMismatch
 from pmsmtool.estimators.shaft.inertia_ratio import regress
 from pmsmtool.estimators.shaft.mechanics import require_useful
-from pmsmtool.estimators.shaft.model import Run
-from pmsmtool.estimators.shaft.motion import DECAY_MOST, _coast, _stops_after, positions
+from pmsmtool.estimators.shaft.model import DECAY_MOST, Run, _coast, _stops_after, positions
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import WINDING_TOLERANCE

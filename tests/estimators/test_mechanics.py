@@ -26,8 +26,7 @@ from pmsmtool.estimators.shaft.mechanics import (
     mean_mechanics,
     require_useful,
 )
-from pmsmtool.estimators.shaft.model import Run
-from pmsmtool.estimators.shaft.motion import positions
+from pmsmtool.estimators.shaft.model import Run, positions
 from pmsmtool.experiments.mechanics_run import UNIT_LEAST_S, UNIT_MOST_S, plan_mechanics
 from pmsmtool.trace import Trace
 

@@ -14,7 +14,7 @@ from benchmarks.mechanics_accuracy import realisation
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import CHI2_WARN
 from pmsmtool.estimators.shaft.mechanics import estimate_mechanics
-from pmsmtool.estimators.shaft.motion import positions
+from pmsmtool.estimators.shaft.model import positions
 from pmsmtool.estimators.shaft.position import encoder_step, position_std, rounding_rad
 from pmsmtool.trace import Trace
 

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 
 from pmsmtool.arrays import Array
-from pmsmtool.estimators.shaft.motion import DECAY_MOST, _stops_after, positions
+from pmsmtool.estimators.shaft.model import DECAY_MOST, _stops_after, positions
 
 J = 2e-4
 T = 1e-3

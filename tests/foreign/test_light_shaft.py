@@ -13,13 +13,14 @@ import pytest
 from pmsmtool.drive.objects import signal_unit
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.flux.voltage_flux import STEADY
-from pmsmtool.experiments import recorded_push
 from pmsmtool.experiments.polled_push import (
-    LEAST_RAMP_S,
+    POLLED_RAMP_S,
     PolledPushPlan,
+    PushPlan,
     coast_both_ways,
     push_both_ways,
     run_to_voltage,
+    swing,
 )
 from pmsmtool.trace import Trace
 
@@ -87,7 +88,7 @@ def test_no_push_goes_beyond_the_plans_speed(rate: float) -> None:
     shaft, plan = Shaft(rate), PolledPushPlan(10.0, 40.0, 100.0)
     push_both_ways(cast(Drive, shaft), plan, lambda name, trace: None)
     assert shaft.fastest < 1.3 * plan.omega_m_rad_s
-    if rate * 7.0 * LEAST_RAMP_S < 40.0:
+    if rate * 7.0 * POLLED_RAMP_S < 40.0:
         assert max(shaft.asked) == pytest.approx(7.0), "a heavier shaft is pushed as before"
 
 
@@ -153,8 +154,8 @@ def test_a_tool_that_dies_at_any_moment_leaves_a_shaft_within_the_speed(
 @pytest.mark.parametrize(("rate", "friction"), LIGHT_TO_HEAVY)
 def test_recorded_pushes_keep_it_too(rate: float, friction: float, direction: int) -> None:
     shaft = Shaft(rate, friction, direction)
-    plan = recorded_push.PushPlan(10.0, 40.0, samples=64, omega_failure_rad_s=MOST, off_s=0.5)
-    recorded_push.swing(cast(Drive, shaft), plan, lambda name, trace: None)
+    plan = PushPlan(10.0, 40.0, samples=64, omega_failure_rad_s=MOST, off_s=0.5)
+    swing(cast(Drive, shaft), plan, lambda name, trace: None)
     assert shaft.at_failure <= NEAR * MOST
     assert abs(shaft.speed) < AT_REST * plan.omega_m_rad_s
     assert shaft.fastest > 10.0, "with friction of a tenth, 15 to 30 of the 40 that are aimed at"

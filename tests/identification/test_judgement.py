@@ -12,8 +12,8 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.identification import by_pulses
 from pmsmtool.identification.by_pulses import PulseFacts, pulse_result
 from pmsmtool.identification.completed_machine import completed_machine
-from pmsmtool.identification.judgement import Judgement, judged, stage_of
 from pmsmtool.identification.request import Method
+from pmsmtool.identification.value_verdict import Judgement, judged, stage_of
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.cli.main import run as program
-from pmsmtool.experiments.recorded_push import VOLTAGE_SHARE, PushPlan, _slower
+from pmsmtool.experiments.polled_push import VOLTAGE_SHARE, PushPlan, _slower
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace
 from tests.simulated_bus import settle

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pmsmtool.packaging import backend, compiler, page_module
+from pmsmtool.packaging import backend, build_kernels, compiler
 from pmsmtool.packaging.kernels import here
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -102,10 +102,10 @@ def test_without_ziglang_the_page_is_left_out_and_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert page_module.build_page_module(ROOT / "pmsmtool", tmp_path) == []
+    assert build_kernels.build_page_module(ROOT / "pmsmtool", tmp_path) == []
     assert "reports do not recompute themselves: ziglang is not installed" in capsys.readouterr().err
     with pytest.raises(compiler.CompilerError):
-        page_module.build_page_module(ROOT / "pmsmtool", tmp_path, strict=True)
+        build_kernels.build_page_module(ROOT / "pmsmtool", tmp_path, strict=True)
 
 
 def test_cc_that_does_not_work_is_an_error_not_a_fallback(monkeypatch: pytest.MonkeyPatch) -> None:

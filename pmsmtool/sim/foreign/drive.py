@@ -15,12 +15,12 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.clock import Schedule, Timer
 from pmsmtool.errors import ConfigError
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.families import assumed_modes, family_of, laws_of, modes_of, units_of
 from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects, oddities_of, read_makers_objects
-from pmsmtool.sim.foreign.guarding import NodeGuarding
 from pmsmtool.sim.foreign.laws import Law
 from pmsmtool.sim.foreign.position import PositionLoop
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
@@ -29,9 +29,9 @@ from pmsmtool.sim.node.node import VENDOR
 from pmsmtool.sim.node.objects import ObjectRow
 
 if TYPE_CHECKING:
+    from pmsmtool.bus.clock import Schedule
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.sim.node.power_drive import Plant, PowerDrive
-    from pmsmtool.sim.node.schedule import Schedule
     from pmsmtool.sim.node.session import Session
 
 COMMUNICATION = frozenset((*range(0x1000, 0x1200), *range(0x1400, 0x1C00)))
@@ -49,6 +49,9 @@ REVISION = 3
 PID_MARKS = {(0x30A1, 3), (0x60FB, 3)}
 """Gain of the derivative, by which one controller of the position is known."""
 SERIAL = (0x1018, 4)
+
+_MS = 1_000_000
+TOGGLE = 0x80
 
 
 class ForeignDrive:
@@ -268,3 +271,68 @@ def _taken(entry: Entry, act: Callable[[float], object]) -> Callable[[bytes], No
             raise
 
     return sink
+
+
+class NodeGuarding:
+    """Answers the master's remote frames, and watches that they come.
+
+    It watches from the first remote frame on, and only while there is a life time (0x100C x 0x100D) and no heartbeat.
+
+    Parameters
+    ----------
+    guard_ms, factor, heartbeat_ms : Entry
+        Objects 0x100C, 0x100D and 0x1017.
+    schedule : Schedule
+        Of the session.
+    answer : callable
+        Sends the NMT state with the toggle bit (0 or ``TOGGLE``).
+    lost, regained : callable
+        Called when no remote frame came within the life time; when one comes again.
+    """
+
+    def __init__(
+        self,
+        guard_ms: Entry,
+        factor: Entry,
+        heartbeat_ms: Entry | None,
+        schedule: Schedule,
+        answer: Callable[[int], None],
+        lost: Callable[[], None],
+        regained: Callable[[], None],
+    ) -> None:
+        self._guard_ms, self._factor, self._heartbeat_ms = guard_ms, factor, heartbeat_ms
+        self._schedule = schedule
+        self._answer, self._lost, self._regained = answer, lost, regained
+        self._toggle = 0
+        self._deadline_ns = 0
+        self._timer: Timer | None = None
+        self._missing = False
+
+    def asked(self) -> None:
+        """Take a remote frame."""
+        if self._heartbeat_ms is not None and self._heartbeat_ms.integer():
+            return  # a node does not guard and send heartbeats at once
+        self._answer(self._toggle)
+        self._toggle ^= TOGGLE
+        if self._missing:
+            self._missing = False
+            self._regained()
+        self._deadline_ns = self._schedule.now_ns + self._life_ns()
+        if self._timer is None and self._life_ns():
+            self._plan()
+
+    def _life_ns(self) -> int:
+        return self._guard_ms.integer() * self._factor.integer() * _MS
+
+    def _plan(self) -> None:
+        self._timer = self._schedule.at(self._deadline_ns, self._check)
+
+    def _check(self) -> None:
+        self._timer = None
+        if not self._life_ns():
+            return
+        if self._deadline_ns > self._schedule.now_ns:
+            self._plan()
+            return
+        self._missing = True
+        self._lost()

@@ -17,8 +17,8 @@ from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 
 if TYPE_CHECKING:
+    from pmsmtool.bus.clock import Schedule
     from pmsmtool.sim.node.power_drive import PowerDrive
-    from pmsmtool.sim.node.schedule import Schedule
 
 TURN = 2.0 * math.pi
 NEW_SET_POINT, AT_ONCE, RELATIVE, HALT = 0x0010, 0x0020, 0x0040, 0x0100

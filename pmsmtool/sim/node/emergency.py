@@ -6,9 +6,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 
-from pmsmtool.bus.clock import NS
+from pmsmtool.bus.clock import NS, Schedule
 from pmsmtool.sim.node.dictionary import Dictionary
-from pmsmtool.sim.node.schedule import Schedule
 
 _EMCY = struct.Struct("<HB5s")
 _HISTORY = 8

@@ -6,9 +6,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
+    from pmsmtool.bus.clock import Schedule
     from pmsmtool.sim.node.dictionary import Dictionary
     from pmsmtool.sim.node.power_drive import Plant, PowerDrive
-    from pmsmtool.sim.node.schedule import Schedule
     from pmsmtool.sim.node.session import Session
 
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.clock import Schedule
 from pmsmtool.cia402 import Mode
 from pmsmtool.data_types import SHORT
 from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, SignalCell
@@ -20,15 +21,12 @@ from pmsmtool.drive_maps.motion_objects import UNDECIDED
 from pmsmtool.drive_maps.wire_units import WireUnit, wire_unit
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, TORQUE_PER_AMPERE
-from pmsmtool.sim.node import own_identification
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.family_position import INCREMENTS, PID, PROFILE, SPEED, PositionSide, pid_of
-from pmsmtool.sim.node.monitor import Monitor
+from pmsmtool.sim.node.makers_recorders import Monitor, Rings, TraceRows
 from pmsmtool.sim.node.objects import ObjectRow
+from pmsmtool.sim.node.own_measurements import OsCommands
 from pmsmtool.sim.node.power_drive import Plant, PowerDrive
-from pmsmtool.sim.node.rings import Rings
-from pmsmtool.sim.node.schedule import Schedule
-from pmsmtool.sim.node.trace_rows import TraceRows
 from pmsmtool.units import RAD_S_PER_MRPM
 
 OWN = range(0x2000, 0x6000)
@@ -142,7 +140,8 @@ class Face:
         kind = RECORDERS.get(self.drive_map.capabilities.recorder)
         if kind is not None:
             kind(self.drive_map, dictionary, plant)
-        own_identification.attach(self.drive_map, dictionary, plant, power, schedule)
+        if self.drive_map.vendor_tuning is not None:
+            OsCommands(self.drive_map.vendor_tuning, dictionary, plant, power, schedule)
 
     def guarding(self, session: object) -> None:
         """Return none: a family is shown without node guarding."""

@@ -6,9 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.bus.clock import Timer
+from pmsmtool.bus.clock import Schedule, Timer
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
-from pmsmtool.sim.node.schedule import Schedule
 
 CONSUMERS = 4
 _MS = 1_000_000

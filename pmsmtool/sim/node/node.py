@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from pmsmtool.bus.clock import VirtualClock
+from pmsmtool.bus.clock import Schedule, VirtualClock
 from pmsmtool.sim.faults import Absence
 from pmsmtool.sim.node import store as storing
 from pmsmtool.sim.node.drive_core import DriveCore
@@ -16,7 +16,6 @@ from pmsmtool.sim.node.face import DriveFace
 from pmsmtool.sim.node.lss import UNCONFIGURED
 from pmsmtool.sim.node.memory import Memory
 from pmsmtool.sim.node.parameter_set import ParameterImage
-from pmsmtool.sim.node.schedule import Schedule
 from pmsmtool.sim.node.session import Session
 from pmsmtool.sim.node.store import Store
 

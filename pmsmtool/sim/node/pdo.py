@@ -7,10 +7,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.bus.clock import Timer
+from pmsmtool.bus.clock import Schedule, Timer
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.objects import ObjectRow
-from pmsmtool.sim.node.schedule import Schedule
 
 COUNT = 4
 MAX_OBJECTS = 8

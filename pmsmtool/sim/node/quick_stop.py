@@ -11,11 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from pmsmtool.bus.clock import NS, Timer
+from pmsmtool.bus.clock import NS, Schedule, Timer
 from pmsmtool.cia402 import QuickStop
 from pmsmtool.sim.node.dictionary import Dictionary
 from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore
-from pmsmtool.sim.node.schedule import Schedule
 from pmsmtool.sim.signals import Signal
 from pmsmtool.units import RAD_S_PER_RPM
 

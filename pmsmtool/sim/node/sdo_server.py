@@ -15,9 +15,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.bus.clock import NS, Timer
+from pmsmtool.bus.clock import NS, Schedule, Timer
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
-from pmsmtool.sim.node.schedule import Schedule
 
 TIMEOUT_S = 1.0
 """Silence after which an open transfer is aborted with 0x05040000."""

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from enum import IntEnum
 from typing import Protocol
 
+from pmsmtool.bus.clock import Schedule
 from pmsmtool.cia402 import State
 from pmsmtool.firmware.image import crc32
 from pmsmtool.sim.node import store as storing
@@ -20,7 +21,6 @@ from pmsmtool.sim.node.measurement import Measurement
 from pmsmtool.sim.node.parameter_set import ParameterImage, ParameterSet
 from pmsmtool.sim.node.pdo import ProcessData
 from pmsmtool.sim.node.power_drive import PDO_MISSED, Plant, PowerDrive
-from pmsmtool.sim.node.schedule import Schedule
 from pmsmtool.sim.node.sdo_server import SdoServer
 from pmsmtool.sim.node.store import Group, Store, Stored
 

@@ -12,10 +12,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import Enum
 
 from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.clock import Schedule
 from pmsmtool.errors import ConfigError
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.memory import Memory
-from pmsmtool.sim.node.schedule import Schedule
 
 Stored = dict[int, bytes]
 """Bytes by object (index << 8 | sub)."""
