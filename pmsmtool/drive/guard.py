@@ -52,6 +52,11 @@ _AS_GIVEN: Mapping[str, tuple[Callable[[float], float], str]] = {
     "rad/s": (rpm_from_rad_s, "rpm"), "rad": (math.degrees, "deg"),
 }  # fmt: skip
 """How a limit is given (``--speed-max``, ``--travel``), by its SI unit."""
+_OTHER_UNIT = {
+    "current": "the loop overshoots, or what shows the current is no permille of the rated one (0x6078, 0x6077)",
+    "speed": "a shaft lighter than taken, or a turn has other units of position than 0x608F, 0x6092 or the map state",
+}
+"""Likely causes on a drive of which only CiA 402 is known: whatever bounds its commands rests on these units."""
 _NEXT_STEP = {
     "current": "raise the limit knowingly (--i-max), or ask for less",
     "d current": "state i_d_min_apk in the machine file where the magnets stand more, or ask for less",
@@ -474,6 +479,11 @@ class GuardedDrive:
             i_d = min(abs(i_d), abs(self._drive.live("i_d_a")))
         return math.hypot(i_d, i_q)
 
+    def _likely(self, quantity: str) -> str:
+        if quantity == "travel" and self.envelope.shaft == "locked":
+            return _TURNS
+        return _OTHER_UNIT.get(quantity, "") if self._drive.commands_bounded_current else ""
+
     def _check(self, quantity: str, value: float, limit: float, unit: str) -> None:
         if not value <= limit * (1.0 + _ROUNDING):
             as_given, shown = _AS_GIVEN.get(unit, (float, unit))
@@ -483,7 +493,7 @@ class GuardedDrive:
                 as_given(limit),
                 shown,
                 where=f"node {self._node.node}",
-                likely=_TURNS if quantity == "travel" and self.envelope.shaft == "locked" else "",
+                likely=self._likely(quantity),
                 hint=_NEXT_STEP.get(quantity, "ask for less"),
             )
 

@@ -75,6 +75,14 @@ ADD_INERTIA = (
     "limits)"
 )
 CHECK_WIRING = "switch off and measure the three line-line resistances; `pmsmtool check` looks at the wiring"
+REFUSED_AS = {
+    "phases": ("E_PHASE_OPEN", CHECK_WIRING),
+    "current sensors": (
+        "E_CURRENT_SENSOR",
+        "name what shows the torque current in a map ([motion], current)",
+    ),
+}
+"""What of the pulses takes every number along: the name of the refusal, and the next step."""
 UNDECIDED = "no source says whether this drive's amperes are peak or rms: the interval holds for both"
 Voltage = Literal["machine", "link", ""]
 
@@ -240,10 +248,9 @@ def _by_torque(
     estimates: dict[str, Estimate] = {}
     too_wide: IdentificationError | None = None
     for wrong in judge_pulses(pushes):
-        if wrong.looked_at == "phases":
-            raise IdentificationError(
-                "E_PHASE_OPEN", wrong.shown, where="torque pulses", likely=wrong.likely, hint=CHECK_WIRING
-            )
+        if wrong.looked_at in REFUSED_AS:
+            name, hint = REFUSED_AS[wrong.looked_at]
+            raise IdentificationError(name, wrong.shown, where="torque pulses", likely=wrong.likely, hint=hint)
         missing[SIGN] = f"{wrong.shown} (likely {wrong.likely}; try: `pmsmtool check`)"
     try:
         estimates = estimate_ratios(pushes, pole_pairs=pole_pairs or 1, tolerance=tolerance)

@@ -55,7 +55,8 @@ SIGN_BY = "two motor leads swapped, or the encoder's tracks"
 SIGN_FOUND = f"{SIGN_BY}; identify finds the sign by itself and sets it"
 POLARITY_BY = f"the polarity of the position (0x607E), or {SIGN_BY}"
 FALLS = "the position falls under positive torque"
-OPEN_BY = "an open phase, or the supply in current limit"
+OPEN_BY = "an open phase, or the supply in current limit; where the shaft turns all the same, what shows the current"
+SIGN_BY = "the object that shows the current has the other sign, or shows magnitudes (0x6078, 0x6077, or the map's)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,10 +210,11 @@ def judge_push(pushes: Trace) -> list[Finding]:
         Shaft, sign, and the phases where no current flows.
     """
     command, way = pushes["i_command_a"], pushes["way_rad"]
+    turned = _sign_shown(pushes["i_q_a"] / command, command)
     share = float(np.mean(pushes["i_q_a"] / command))
     ways = " and ".join(f"{math.degrees(each):+.2g} deg" for each in way)
-    found = []
-    if share < LEAST_CURRENT:
+    found = turned
+    if share < LEAST_CURRENT and not turned:
         seen = f"the drive shows {100.0 * share:.2g} % of the current asked for"
         found.append(Finding("phases", WRONG, seen, OPEN_BY))
     if not np.any(way):
@@ -241,6 +243,11 @@ def judge_pulses(pulses: Sequence[Trace]) -> list[Finding]:
     shown = _given(known, commands)
     if not len(shown):
         return []
+    each = [_given([pulse], [i]) for pulse, i in zip(known, commands, strict=True)]
+    told = [(float(np.median(given)), i) for given, i in zip(each, commands, strict=True) if len(given)]
+    turned = _sign_shown(*np.array(told).reshape(-1, 2).T)
+    if turned:
+        return turned
     low, share = (float(np.percentile(shown, percent)) for percent in (10.0, 50.0))
     if share < LEAST_CURRENT:
         return [Finding("phases", WRONG, f"the drive shows {100.0 * share:.2g} % of the current asked for", OPEN_BY)]
@@ -251,6 +258,17 @@ def judge_pulses(pulses: Sequence[Trace]) -> list[Finding]:
     if sum(math.copysign(1.0, bend * i) for bend, i in zip(bends, commands, strict=True)) < 0.0:
         return [Finding("encoder sign", WRONG, FALLS, POLARITY_BY)]
     return []
+
+
+def _sign_shown(shares: NDArray[np.float64], commands: NDArray[np.float64]) -> list[Finding]:
+    """Judge whether currents of both signs flow and one of them is shown with the other sign."""
+    if not (np.any(commands > 0.0) and np.any(commands < 0.0)):
+        return []
+    forth, back = (float(np.median(shares[commands * sign > 0.0])) for sign in (1.0, -1.0))
+    if min(abs(forth), abs(back)) < LEAST_CURRENT or min(forth, back) > 0.0:
+        return []
+    seen = f"of a positive current {100.0 * forth:.2g} % is shown, of a negative one {100.0 * back:.2g} %"
+    return [Finding("current sensors", WRONG, seen, SIGN_BY)]
 
 
 def _given(pulses: Sequence[Trace], commands: Sequence[float]) -> NDArray[np.float64]:

@@ -182,13 +182,15 @@ def test_answers_that_come_late_are_no_open_phase(tool: Tool, monkeypatch: pytes
     assert "answers slowly" in said
 
 
-def pulsed(shown: float, sense: float, noise_rad: float = 0.0, seed: int = 1) -> list[tuple[str, str]]:
+def pulsed(
+    shown: float, sense: float, noise_rad: float = 0.0, seed: int = 1, sign: Callable[[float], float] = float
+) -> list[tuple[str, str]]:
     """Verdicts on twelve pulses of which ``shown`` of the command is seen and that move the shaft in ``sense``."""
     rng, pulses = np.random.default_rng(seed), []
     for command in (0.3, -0.3, 0.3, -0.3, 0.5, -0.5, 0.5, -0.5, 0.7, -0.7, 0.7, -0.7):
         t = np.linspace(0.0, 0.08, 80)
         way = sense * 40.0 * command * t * t - 2.0 * command * t + rng.normal(0.0, noise_rad, len(t))
-        signals = {"theta_M_rad": way, "i_q_a": np.full(len(t), shown * command)}
+        signals = {"theta_M_rad": way, "i_q_a": np.full(len(t), shown * sign(command))}
         pulses.append(Trace(t, signals, {"theta_M_rad": "rad", "i_q_a": "A"}, {"i_command_a": command}))
     return [(row.looked_at, row.verdict) for row in judge_pulses(pulses)]
 
@@ -198,7 +200,9 @@ def test_the_pulses_of_identify_show_a_missing_current_and_a_wrong_sign(seed: in
     """The bend of the least pulse is 0.08 rad in its time; an encoder of 1024 counts leaves 2 mrad of noise."""
     assert pulsed(0.97, 1.0, 2e-3, seed) == pulsed(0.71, 1.0, 2e-3, seed) == []
     assert pulsed(0.97, -1.0, 2e-3, seed) == [("encoder sign", WRONG)]
-    assert pulsed(0.21, 1.0, 2e-3, seed) == [("phases", WRONG)]
+    assert pulsed(0.21, 1.0, 2e-3, seed) == pulsed(0.0, 1.0, 2e-3, seed) == [("phases", WRONG)]
+    for shown, sign in ((-0.97, float), (0.97, abs), (-0.97, abs)):  # as an open phase: "-89 % of the current"
+        assert pulsed(shown, 1.0, 2e-3, seed, sign) == [("current sensors", WRONG)]
 
 
 def pulses_of(shown: Callable[[float, float, float], float], top: float = 1e9) -> list[str]:
