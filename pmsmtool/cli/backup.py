@@ -45,7 +45,7 @@ def backup_command(
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.journal import write_snapshot
     from pmsmtool.flash.restore import take_backup
-    from pmsmtool.flash.whole_drive import other_product, take_whole_backup
+    from pmsmtool.flash.whole_drive import other_product, require_read, take_whole_backup
 
     if path.exists() and not force:
         raise ConfigError("the file exists", where=str(path), hint="choose another name, or --force")
@@ -83,6 +83,7 @@ def backup_command(
         "left_out": left_out,
     }
     out.result("backup", data, [f"{len(snapshot.entries)} objects of serial {identity.serial} in {path}"])
+    require_read(left_out, path)
 
 
 def _listed(eds: str) -> list[Listed]:

@@ -108,9 +108,9 @@ def _from_dcf(path: Path, drive_map: DriveMap) -> ParameterSet:
             differs, where=str(path), likely="the file of another drive, whose objects mean something else",
             hint="give the map that this file is for with --map, or the file of the map's drive",
         )  # fmt: skip
-    values = values_of(sheet)
-    names = (*drive_map.cells, *drive_map.tables)
-    found = {name: values[drive_map.address(name)] for name in names if drive_map.address(name) in values}
+    addresses = {name: drive_map.address(name) for name in (*drive_map.cells, *drive_map.tables)}
+    values = values_of(sheet, frozenset(addresses.values()))
+    found = {name: values[address] for name, address in addresses.items() if address in values}
     if not found:
         raise ConfigError(
             f"holds no parameter of the drive family {drive_map.name}",

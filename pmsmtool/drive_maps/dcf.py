@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass
 
 from pmsmtool.drive_maps.eds import (
@@ -230,8 +230,8 @@ def new_dcf(
 
 
 @next_step(NEXT_STEP)
-def values_of(sheet: Eds) -> dict[Address, bytes]:
-    """Return every ``ParameterValue`` of a DCF, encoded; objects without one are not in the result.
+def values_of(sheet: Eds, wanted: Container[Address] | None = None) -> dict[Address, bytes]:
+    """Return the ``ParameterValue`` of every object that is wanted (all: None) and has one, encoded.
 
     Raises
     ------
@@ -241,7 +241,7 @@ def values_of(sheet: Eds) -> dict[Address, bytes]:
     found: dict[Address, bytes] = {}
     wrong = []
     for address, entry in sheet.objects.items():
-        if not entry.value:
+        if not entry.value or (wanted is not None and address not in wanted):
             continue
         try:
             found[address] = decode_value(entry.data_type, entry.value, sheet.node_id)

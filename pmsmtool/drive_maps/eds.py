@@ -24,7 +24,7 @@ _VAR, _DOMAIN_OBJECT = 0x07, 0x02
 _HAVE_SUBS = frozenset({0x06, 0x08, 0x09})  # DEFSTRUCT, ARRAY, RECORD
 
 _SECTION = re.compile(r"\s*\[([^\]]*)\]?\s*(?:;.*)?$")
-_OBJECT = re.compile(r"([0-9A-Fa-f]{1,4})(?:sub([0-9A-Fa-f]{1,2}))?\Z", re.IGNORECASE)
+_OBJECT = re.compile(r"(?:0x)?([0-9A-F]{1,4})(?:[ _]*sub[ _]*([0-9A-F]{1,2}))?\Z", re.IGNORECASE)
 _REMARK = re.compile(r"[;#]|//")
 OCTAL = re.compile("0[0-7]+")
 """As C writes it; makers rather fill decimal numbers up with zeros."""
@@ -277,7 +277,8 @@ def _entry(
     place: str,
     warnings: list[str],
 ) -> EdsObject:
-    data_type = _number(section.get("datatype"), None, f"{place} DataType", warnings)
+    word = DATA_TYPES.get(section.get("datatype").upper())
+    data_type = word.code if word else _number(section.get("datatype"), None, f"{place} DataType", warnings)
     if not isinstance(data_type, int):
         data_type = DOMAIN if kind == _DOMAIN_OBJECT else 0
         if data_type == 0:

@@ -113,6 +113,10 @@ def test_update_changes_only_the_values() -> None:
     again = eds.parse_eds(new)
     assert dcf.values_of(again)[0x2010, 2] == struct.pack("<f", 0.137)
     assert dcf.update_dcf(new, {}) == new
+    odd = eds.parse_eds(new.replace(b"ParameterValue=0x08", b"ParameterValue=$NODEID+0x180"))
+    assert dcf.values_of(odd, {(0x2010, 2)}) == {(0x2010, 2): struct.pack("<f", 0.137)}, "no other value is in the way"
+    with pytest.raises(ConfigError, match="cannot be used"):
+        dcf.values_of(odd)
 
 
 def test_crlf_files_stay_crlf() -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -101,6 +102,20 @@ def test_a_file_of_another_size_than_is_read_is_refused(tmp_path: Path) -> None:
         file.truncate(50 << 20)
     with pytest.raises(ConfigError, match="more than the 8 MiB"):
         read_makers_objects(str(path))
+
+
+@pytest.mark.parametrize(
+    ("written", "so"),
+    [("[", "[0x"), ("sub", " sub "), ("sub", "_Sub"), ("DataType=0x0007", "DataType=UNSIGNED32")],
+)
+def test_sections_and_types_in_other_spellings(tmp_path: Path, written: str, so: str) -> None:
+    """Whole records were left out, without a word."""
+    path = write_eds(tmp_path / "x.eds", unknown())
+    plain = path.read_bytes()
+    other = plain.replace(written.encode(), so.encode()).replace(b"[0xFileInfo", b"[FileInfo")
+    assert other != plain
+    kept = [{at: replace(entry, line=0) for at, entry in parse_eds(text).objects.items()} for text in (plain, other)]
+    assert kept[0] == kept[1] and len(kept[0]) > 20
 
 
 def test_how_odd_lines_are_read_is_told(tmp_path: Path) -> None:

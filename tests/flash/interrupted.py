@@ -17,6 +17,7 @@ from pmsmtool.flash.restore import marks_of
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.node.memory import RamStorage
 from pmsmtool.sim.node.parameter_set import ParameterImage
+from pmsmtool.sim.node.store import IMAGE_KEY
 from tests.flash.rig import WHEN, Rig, attach, open_rig
 
 How = Literal["power cut", "killed", "ctrl-c"]
@@ -120,7 +121,7 @@ def _assert_told(rig: Rig, text: str, old: bytes, new: bytes) -> None:
     assert session is not None
     named = [held for words, held in ((_OLD, old), (_NEW, new)) if any(word in text for word in words)]
     assert named == [rig.image()], text
-    stored = session.store.stored.get(0x2001 << 8)
+    stored = session.store.stored.get(IMAGE_KEY)
     assert stored == (new if named == [new] else stored) and stored in (None, *named), text
     journal = rig.folder.last()
     assert journal is None or journal.state != "open"
@@ -135,7 +136,7 @@ def assert_whole(session: object, old: bytes, new: bytes) -> None:
     active = session.parameters.active.pack()  # type: ignore[attr-defined]
     assert active in (old, new), "a mixed set acts"
     assert session.parameters.active_crc == crc32(active)  # type: ignore[attr-defined]
-    stored = session.store.stored.get(0x2001 << 8)  # type: ignore[attr-defined]
+    stored = session.store.stored.get(IMAGE_KEY)  # type: ignore[attr-defined]
     assert stored in (None, old, new), "a mixed set is stored"
 
 

@@ -29,6 +29,7 @@ from pmsmtool.flash.journal import MARKS, JournalFolder
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.sim.line import Frame
 from pmsmtool.sim.node.dictionary import Refused
+from pmsmtool.sim.node.store import IMAGE_KEY
 from tests.flash.rig import SMALL, Rig, attach, open_rig, with_tables
 
 
@@ -461,9 +462,9 @@ def test_value_that_changes_over_the_reset_is_named_and_taken_back(rig: Rig) -> 
     write = session.store.write
 
     def write_something_else(content: dict[int, bytes], done: Callable[[int | None], None]) -> None:
-        image = bytearray(content[0x2001 << 8])
+        image = bytearray(content[IMAGE_KEY])
         image[8:12] = b"\x0a\xd7\x23\x3c"  # L_d_h becomes 0.01
-        write({**content, 0x2001 << 8: bytes(image)}, done)
+        write({**content, IMAGE_KEY: bytes(image)}, done)
 
     session.store.write = write_something_else  # type: ignore[method-assign]
     with pytest.raises(VerifyMismatch, match="after the reset") as caught:

@@ -28,9 +28,11 @@ from pmsmtool.flash.whole_drive import (
     kept_objects,
     other_product,
     readdressed,
+    require_read,
     take_whole_backup,
     whole_map,
 )
+from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.node import Node
 from tests.foreign.data_sheets import Row, epos4, write_eds
 from tests.simulated_bus import settle
@@ -109,6 +111,32 @@ def test_a_spare_part_holds_all_of_it(tmp_path: Path) -> None:
         assert not outcome.refused and outcome.stored and outcome.written >= len(CHANGED) + 3
         for entry in saved.entries:
             assert node.sdo.read(entry.index, entry.sub) == entry.old, entry.name
+
+
+def test_what_a_backup_lacks_is_told_from_what_the_drive_lacks(tmp_path: Path) -> None:
+    """An object that is there and could not be read was left out with exit code 0."""
+    with opened(write_eds(tmp_path / "x.eds", ROWS)) as node:
+        asked = (*listed(), Listed(0x2FFF, 0, "of another firmware"))
+        require_read(take_whole_backup(node, node.identity(), asked)[1], tmp_path)
+        simulated = cast(Node, node.connection.bus.line.nodes[0])  # type: ignore[attr-defined]
+        assert simulated.session is not None
+
+        def refused() -> bytes:
+            raise Refused(AbortCode.DEVICE_STATE)
+
+        simulated.session.dictionary.find(0x30A0, 1).source = refused
+        with pytest.raises(Partial, match="in the backup: 1") as caught:
+            require_read(take_whole_backup(node, node.identity(), asked)[1], tmp_path)
+        assert len(caught.value.missing) == 1 and caught.value.missing[0].startswith("0x30A0:01")
+
+
+def test_an_object_where_the_reference_drive_keeps_its_set(tmp_path: Path) -> None:
+    """0x2001 of a maker's own was overwritten by the simulated drive's set when it was stored."""
+    with opened(write_eds(tmp_path / "x.eds", (*ROWS, (0x2001, 0, "I32", "rw", "-5")))) as node:
+        node.sdo.download(0x2001, 0, b"\xf7\xff\xff\xff")
+        node.store()
+        node.reset()
+        assert node.sdo.read(0x2001, 0) == b"\xf7\xff\xff\xff"
 
 
 def test_a_refused_object_is_named_and_takes_nothing_along(tmp_path: Path) -> None:

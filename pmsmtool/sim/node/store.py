@@ -20,8 +20,8 @@ from pmsmtool.sim.node.memory import Memory
 Stored = dict[int, bytes]
 """Bytes by object (index << 8 | sub)."""
 
-IMAGE_KEY = 0x2001 << 8
-SIGNATURE_KEY = 0x2000 << 8 | 2
+IMAGE_KEY, SIGNATURE_KEY = 0x2001 << 8 | 0xFF, 0x2000 << 8 | 0xFF
+"""The set and its signature: sub-index 0xFF is nobody's value (CiA 301), another maker's 0x2001 stays its own."""
 NODE_ID_KEY = 0
 """Pseudo-object of the node id that LSS stored."""
 
