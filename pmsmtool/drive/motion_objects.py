@@ -136,9 +136,16 @@ def rated_ma(node: DriveNode) -> float | None:
 
 def rated_current(node: DriveNode) -> Quantity | None:
     """Return where the rated current stands; None where nobody knows."""
-    if rated_ma(node) is not None:
-        return Quantity(objects.RATED_CURRENT_MA, RATED_RMS)
-    return _own(node, "rated_current")
+    return _stated_rated(node) if rated_ma(node) is not None else _own(node, "rated_current")
+
+
+def _stated_rated(node: DriveNode) -> Quantity:
+    """Return 0x6075 as a map states it; without such a row nobody says whether it is peak or rms."""
+    own = _own(node, "rated_current")
+    standard = objects.RATED_CURRENT_MA
+    if own is not None and (own.item.index, own.item.sub) == (standard.index, standard.sub):
+        return own
+    return Quantity(standard, RATED_RMS, undecided=True)
 
 
 def rated_apk(node: DriveNode) -> float:
@@ -151,7 +158,7 @@ def rated_apk(node: DriveNode) -> float:
     """
     found = rated_ma(node)
     if found is not None:
-        return RATED_RMS * found
+        return _stated_rated(node).per_count * found
     row = node.map.motion.get("rated_current")
     if row is not None and row.number:  # no object holds it: its owner wrote it into the map
         return row.per_count * row.number

@@ -83,7 +83,10 @@ REFUSED_AS = {
     ),
 }
 """What of the pulses takes every number along: the name of the refusal, and the next step."""
-UNDECIDED = "no source says whether this drive's amperes are peak or rms: the interval holds for both"
+UNDECIDED = (
+    "no source says whether this drive's amperes are peak or rms: the interval holds for both; a map of your own may "
+    "say it (rated_current)"
+)
 Voltage = Literal["machine", "link", ""]
 
 

@@ -166,6 +166,7 @@ pdo = true
 [objects]
 [motion]
 counts_per_turn = { number = 131072, source = "plate" }
+rated_current = { index = 0x6075, sub = 0, type = "UNSIGNED32", unit = "mA rms", source = "plate" }
 [sources]
 plate = "name plate"
 """

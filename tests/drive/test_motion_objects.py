@@ -25,6 +25,7 @@ GENERIC = load_family("cia402")
 PEAK, RMS, OPEN = "10 mA peak", "10 mA rms", "10 mA peak-or-rms"
 OWN = DriveObject(0x3001, 1, "H")
 RATED = {objects.RATED_CURRENT_MA: 4000}
+STATED = MotionObject(0x6075, 0, "UNSIGNED32", "mA peak", "s")
 RATED_APK = 4.0 * math.sqrt(2.0)
 
 
@@ -44,6 +45,7 @@ def drive(held: Held, signals: dict[str, SignalCell] | None = None, /, **rows: M
     [
         (RATED, {}, RATED_APK, "0x6075"),
         ({**RATED, OWN: 700}, {"rated_current": own(PEAK)}, RATED_APK, "0x6075"),  # the standard's first
+        (RATED, {"rated_current": STATED}, RATED_APK / math.sqrt(2.0), "0x6075"),  # which a map says is peak
         ({OWN: 700}, {"rated_current": own(PEAK)}, 7.0, "0x3001:01"),
         ({OWN: 700}, {"rated_current": own(RMS)}, 7.0 * math.sqrt(2.0), "0x3001:01"),
         ({OWN: 700}, {"rated_current": own(OPEN)}, 7.0 * math.sqrt(2.0), "0x3001:01"),
@@ -76,8 +78,10 @@ SIGNAL = DriveObject(0x3002, 2, "h")
         ({objects.CURRENT_PERMILLE: 0, OWN: 0}, {}, {"current": own(PEAK)}, Quantity(OWN, 0.01), False),
         ({OWN: 0}, {}, {"current": own(OPEN)}, Quantity(OWN, 0.01 * math.sqrt(2.0), True), True),
         ({**RATED, objects.CURRENT_PERMILLE: 0}, {}, {"current": own(PEAK)}, Quantity(objects.CURRENT_PERMILLE, 0.01),
-         False),
+         True),  # the standard leaves open which of both 0x6075 is
         ({**RATED, objects.CURRENT_PERMILLE: 0, motion.TORQUE_PERMILLE: 0}, I_Q, {},
+         Quantity(objects.CURRENT_PERMILLE, 0.01), True),
+        ({**RATED, objects.CURRENT_PERMILLE: 0}, {}, {"rated_current": STATED},
          Quantity(objects.CURRENT_PERMILLE, 0.01), False),
         ({OWN: 0, objects.CURRENT_PERMILLE: 0}, {}, {"rated_current": own(OPEN)},
          Quantity(objects.CURRENT_PERMILLE, 0.01), True),

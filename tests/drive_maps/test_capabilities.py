@@ -235,7 +235,8 @@ def test_identify_by_cia402_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Pat
     assert truth.J_kgm2 is not None
     # without a machine file the dead time is unknown: it takes 4 % here, within the interval of 6 %
     assert values["psi_f_wb"] == pytest.approx(truth.psi_f_wb, rel=0.06)
-    assert values["J_per_psi"] == pytest.approx(truth.J_kgm2 / truth.psi_f_wb, rel=0.02)
+    read_as_both = 0.5 * (1.0 + math.sqrt(0.5))  # 0x6075 may be peak or rms: the interval reaches from one to the other
+    assert values["J_per_psi"] == pytest.approx(read_as_both * truth.J_kgm2 / truth.psi_f_wb, rel=0.02)
 
 
 def test_flash_params_takes_the_map_of_the_drives_family(tmp_path: Path) -> None:
