@@ -139,15 +139,15 @@ def move_command(
         out.note(f"changed for the move: {counts}")
     run.save(TRACE, trace_npz(trace))
     found = move_result(trace)
-    unseen = [] if trace.meta["direction_seen"] else [UNSEEN]
-    for line in unseen:
+    doubts = trace.meta["doubts"]
+    for line in doubts:
         out.warn(line)
     values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]
     values += [{"name": name, "value": value, "unit": _unit(name)} for name, value in gains.items()]
     peak = math.degrees(found.error_peak_rad)
     run.add(
         Stage(
-            "move", "pass", seconds, values=values, files={TRACE: ""}, fallbacks=unseen,
+            "move", "pass", seconds, values=values, files={TRACE: ""}, fallbacks=doubts,
             summary=f"following error at most {peak:.4g} deg, settling: {shown(found.settling_s, 's')}",
         )
     )  # fmt: skip
@@ -157,7 +157,6 @@ def move_command(
     out.note(f"run: {run.path}")
 
 
-UNSEEN = "before the move little current did not turn the shaft: nothing showed that its position counts the right way"
 IDENTIFY_TIMES = 4
 """Moves there and back for inertia and friction: sixteen halves."""
 

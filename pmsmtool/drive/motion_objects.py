@@ -34,7 +34,10 @@ FEED, FEED_TURNS = DriveObject(0x6092, 1, "I"), DriveObject(0x6092, 2, "I")
 FACTOR, FACTOR_DIVISOR = DriveObject(0x6093, 1, "I"), DriveObject(0x6093, 2, "I")
 """Increments of the encoder per unit of position (CiA 402 of 2002; its later editions leave it out)."""
 STATE_UNITS = "or state the units of a turn in a map (`counts_per_turn`)"
-POSITION_UNIT = DriveObject(0x60A8, 0, "I")
+POSITION_UNIT, SPEED_UNIT = DriveObject(0x60A8, 0, "I"), DriveObject(0x60A9, 0, "I")
+SPEED_SHOWN = DriveObject(0x606C, 0, "i")
+PER_S = {0x03: 1.0, 0x47: 1.0 / 60.0}
+"""One over a second, and over a minute, by the denominator of a unit of speed (CiA 303-2)."""
 PERIOD_VALUE, PERIOD_EXPONENT = DriveObject(0x60C2, 1, "B"), DriveObject(0x60C2, 2, "b")
 """Time between two targets of a cyclic mode, value times 10^exponent s (CiA 402-2, interpolation time period)."""
 POSITION_TURNED = 0x80
@@ -267,6 +270,24 @@ def slow_slope_s(node: DriveNode) -> float:
     return 1000.0 / slope if 1000.0 / slope > SLOW_SLOPE_S else 0.0
 
 
+def shown_speed(node: DriveNode) -> Quantity | None:
+    """Return where the speed of the motor is shown in a unit that is stated (rad/s per count): by a map, or 0x60A9."""
+    signal = node.map.signals.get("omega_M_rad_s")
+    if signal is not None:
+        return Quantity(DriveObject(signal.index, signal.sub, LETTERS[signal.wire]), wire_unit(signal.unit).scale)
+    unit = int(node.held(SPEED_UNIT) or 0)
+    turn, per_s = TURN_IN.get(unit >> 16 & 0xFF), PER_S.get(unit >> 8 & 0xFF)
+    if turn is None or per_s is None or node.held(SPEED_SHOWN) is None:
+        return None
+    return Quantity(SPEED_SHOWN, 2.0 * math.pi / turn * per_s * _decimal(unit))
+
+
+def _decimal(unit: int) -> float:
+    """Return the prefix of a unit (CiA 303-2): a power of ten."""
+    exponent = unit >> 24
+    return 10.0 ** (exponent - 256 if exponent > 127 else exponent)
+
+
 def limited_speed(node: DriveNode) -> LimitedSpeed:
     """Return a velocity mode of known unit whose current limit this program may set.
 
@@ -373,9 +394,9 @@ def _position_units(node: DriveNode) -> float:
 def _shown_units(node: DriveNode) -> float:
     gear = max(1.0, node.held(GEAR_MOTOR) or 1.0) / max(1.0, node.held(GEAR_SHAFT) or 1.0)
     unit = int(node.held(POSITION_UNIT) or 0)
-    numerator, exponent = unit >> 16 & 0xFF, unit >> 24
+    numerator = unit >> 16 & 0xFF
     if numerator in TURN_IN:
-        return TURN_IN[numerator] / 10.0 ** (exponent - 256 if exponent > 127 else exponent) / gear
+        return TURN_IN[numerator] / _decimal(unit) / gear
     feed = node.held(FEED) or 1.0
     if feed > 1.0:
         return feed / max(1.0, node.held(FEED_TURNS) or 1.0) / gear

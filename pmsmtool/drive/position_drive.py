@@ -19,7 +19,7 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
-from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits
+from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits, shown_speed
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.drive.set_point import FOLLOWING_ERROR, POSITION_DEMAND, TARGET_POSITION, WHOLE, start_move
@@ -36,6 +36,10 @@ LARGEST = 0xFFFF_FFFF
 FOLLOWS_S, FOLLOWS_SHARE = 0.05, 0.01
 """A shaft is on its way where in that time it has come nearer by that share of the limit. As their makers' tools leave
 them, loops of 15 rad/s without feed-forward lag 63 to 80 degrees of a move by 90; blocked ones come no nearer."""
+SPEED_AGREES = 0.3
+"""Share by which two speeds of the same moves may differ: one is filtered, and read later than the other."""
+SPEED_S, LEAST_SPEEDS, FAST_SHARE = 0.02, 4, 0.3
+"""Time over which the position shows a speed; speeds that must have been shown, above this share of the largest."""
 WHOLE_WAY = 2.2
 """Limit of the lag over that of a shaft that stands; the latter is half of the way."""
 
@@ -86,6 +90,8 @@ class PositionDrive(TorqueDrive):
         self._taken: list[tuple[float, float, float, float]] = []
         self._recording = False
         self._start_counts = 0.0
+        self._speed = shown_speed(self.node)
+        self._speeds: list[tuple[float, float]] = []
 
     def held_gains(self) -> dict[str, float]:
         """Return the gains of speed and position that the drive holds now, by their names; those of its map."""
@@ -163,6 +169,32 @@ class PositionDrive(TorqueDrive):
         """Angle of one unit of the position (rad)."""
         return 2.0 * math.pi / abs(self.counts_per_turn)
 
+    def look_at_speed(self) -> None:
+        """Note the speed as the drive shows it, where its unit is stated."""
+        if self._speed is not None:
+            began = self.node.connection.clock.now()
+            shown = self._speed.per_count * self.node.get(self._speed.item)
+            self._speeds.append((0.5 * (began + self.node.connection.clock.now()), shown))
+
+    def _speed_doubt(self, table: Array) -> str:
+        """Say where the speed that is shown is not that of the position; empty where it is, or nothing shows it."""
+        t, shown = np.array(self._speeds, dtype=np.float64).reshape(-1, 2).T
+        after, before = (
+            np.interp(t + half, table[:, 0], table[:, 1], math.nan, math.nan) for half in (SPEED_S / 2, -SPEED_S / 2)
+        )
+        seen = np.nan_to_num((after - before) / SPEED_S)
+        fast = np.abs(seen) > FAST_SHARE * np.max(np.abs(seen), initial=0.0)
+        if np.count_nonzero(fast) < LEAST_SPEEDS:
+            return ""
+        ratio = abs(float(shown[fast] @ seen[fast] / (seen[fast] @ seen[fast])))
+        if 1.0 / (1.0 + SPEED_AGREES) <= ratio <= 1.0 + SPEED_AGREES:
+            return ""
+        return (
+            f"the drive shows {ratio:.3g} times the speed of its position ({self._speed}): one of both has another "
+            f"unit than stated. {abs(self.counts_per_turn):.9g} units of position a turn are taken (0x608F, 0x6092, "
+            "or the map)"
+        )
+
     # ---- records --------------------------------------------------------------------------------
 
     def begin_samples(self) -> None:
@@ -205,7 +237,12 @@ class PositionDrive(TorqueDrive):
         table = np.array(self._taken, dtype=np.float64).reshape(len(self._taken), 4)
         units = {"theta_m_rad": "rad", "theta_ref_rad": "rad", "i_q_a": "A"}
         signals = dict(zip(units, table[:, 1:].T, strict=True))
-        return Trace(table[:, 0] - table[:1, 0], signals, units, {"polled": not self.sends})
+        return Trace(
+            table[:, 0] - table[:1, 0],
+            signals,
+            units,
+            {"polled": not self.sends, "speed_doubt": self._speed_doubt(table) if len(table) else ""},
+        )
 
     def wait(self, seconds: float) -> None:
         """Let time pass; asks for samples where the drive does not send them, and watches the following error."""

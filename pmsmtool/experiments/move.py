@@ -23,6 +23,9 @@ TRY_CURRENTS, TRY_S, LOOK_S = (0.1, 0.3), 0.3, 0.01
 counts the other way took a shaft of 1.6e-4 kg m2 to 2046 rpm and 8 turns at once with 6 A, before its drive tripped."""
 
 
+UNSEEN = "before the move little current did not turn the shaft: nothing showed that its position counts the right way"
+
+
 def record_move(
     guard: GuardedDrive, drive: PositionDrive, way_rad: float, settle_s: float, times: int = 1,
     find: tuple[float, float] | None = None,
@@ -37,7 +40,8 @@ def record_move(
     Returns
     -------
     Trace
-        ``theta_m_rad``, ``theta_ref_rad`` (from the start), ``i_q_a``; ``meta``: ``way_rad``, ``direction_seen``.
+        ``theta_m_rad``, ``theta_ref_rad`` (from the start), ``i_q_a``; ``meta``: ``way_rad``, ``doubts``:
+        what these moves do not rest on, one line each.
     MoveProfile or None
         What was found.
 
@@ -64,9 +68,9 @@ def record_move(
     finally:
         guard.stop()
         trace = drive.end_samples()
-    return Trace(
-        trace.t_s, trace.signals, trace.units, {**trace.meta, "way_rad": way_rad, "direction_seen": seen}
-    ), found
+    doubts = [*([] if seen else [UNSEEN]), *filter(None, [trace.meta["speed_doubt"]])]
+    meta = {**trace.meta, "way_rad": way_rad, "doubts": doubts}
+    return Trace(trace.t_s, trace.signals, trace.units, meta), found
 
 
 def _try_direction(guard: GuardedDrive, drive: PositionDrive, way: float) -> bool:
@@ -117,3 +121,4 @@ def _arrive(guard: GuardedDrive, drive: PositionDrive, target: float, way: float
                 "the drive", hint="give --speed and --acceleration, or ask for a shorter way",
             )  # fmt: skip
         guard.wait(0.02)
+        drive.look_at_speed()

@@ -57,6 +57,11 @@ def move_mechanics(trace: Trace, *, pole_pairs: int, undecided: bool, rated_apk:
     IdentificationError
         Too few moves, moves too short for the samples, or they do not tell inertia from friction.
     """
+    if trace.meta.get("speed_doubt"):
+        raise IdentificationError(
+            "E_ENCODER", str(trace.meta["speed_doubt"]), where="moves", likely="0x608F was never set for this encoder",
+            hint="set it with the maker's software, or state counts_per_turn in a map",
+        )  # fmt: skip
     halves = _long_halves(trace)
     if len(halves) < LEAST_PUSHES:
         raise _too_short(halves_of_moves(trace), len(halves))

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""A drive whose speed and position contradict each other: `move` names it, and takes no inertia from it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pmsmtool.sim.foreign.drive import ForeignDrive
+from tests.cli.conftest import Tool
+from tests.foreign.data_sheets import Row, unknown, write_eds
+
+MOVES: tuple[Row, ...] = (
+    (0x6062, 0, "I32", "ro", ""), (0x607A, 0, "I32", "rw", "0"), (0x6081, 0, "U32", "rw", "0"),
+    (0x6083, 0, "U32", "rw", "0"),
+)  # fmt: skip
+
+
+def unit(word: str) -> tuple[Row, ...]:
+    return ((0x60A9, 0, "U32", "rw", word),) if word else ()
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize(
+    ("word", "factor", "named"),
+    [
+        ("0x00B44700", 1.0, False),
+        ("0xFDB40300", 1.0, False),
+        ("0x00B44700", 4.0, True),
+        ("0xFDB44700", 0.5, True),
+        ("", 4.0, False),
+    ],
+)
+def test_a_resolution_that_the_speed_contradicts(
+    tool: Tool, monkeypatch: pytest.MonkeyPatch, word: str, factor: float, named: bool
+) -> None:
+    """0x608F states ``factor`` times what position counts: every angle is as wrong, and nothing had told so."""
+    attach = ForeignDrive.attach
+
+    def set_up(self: ForeignDrive, dictionary: Any, *others: Any) -> None:
+        attach(self, dictionary, *others)
+        entry = dictionary.find(0x608F, 1)
+        entry.value = entry.encode(factor * entry.number())
+
+    monkeypatch.setattr(ForeignDrive, "attach", set_up)
+    eds = write_eds(Path("x.eds"), unknown("0x2D", *MOVES, *unit(word)))
+    asked = ("--yes", "move", "--by", "90deg", "--speed-max", "800rpm", "--settle", "0.2s")
+    sim = ("--sim", f"interior-2k2?nv=:memory:&eds={eds}")
+    code, _, said = tool(*sim, *asked)
+    told = re.search("shows ([0-9.]+) times the speed", said)
+    assert code == 0 and bool(told) == named, said
+    if told:
+        assert float(told[1]) == pytest.approx(factor, rel=0.05)  # 0.499 and 4.00 were seen
+        code, _, said = tool(*sim, *asked, "--speed", "150rpm", "--acceleration", "60", "--identify", "interior-2k2")
+        assert code == 6 and "E_ENCODER" in said and "0x606C" in said, said
