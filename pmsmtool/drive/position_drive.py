@@ -19,7 +19,8 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
-from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits, shown_speed
+from pmsmtool.drive.compared_speed import ComparedSpeed
+from pmsmtool.drive.motion_objects import POSITION, allowed, current_limits
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.drive.set_point import FOLLOWING_ERROR, POSITION_DEMAND, TARGET_POSITION, WHOLE, start_move
@@ -36,10 +37,6 @@ LARGEST = 0xFFFF_FFFF
 FOLLOWS_S, FOLLOWS_SHARE = 0.05, 0.01
 """A shaft is on its way where in that time it has come nearer by that share of the limit. As their makers' tools leave
 them, loops of 15 rad/s without feed-forward lag 63 to 80 degrees of a move by 90; blocked ones come no nearer."""
-SPEED_AGREES = 0.3
-"""Share by which two speeds of the same moves may differ: one is filtered, and read later than the other."""
-SPEED_S, LEAST_SPEEDS, FAST_SHARE = 0.02, 4, 0.3
-"""Time over which the position shows a speed; speeds that must have been shown, above this share of the largest."""
 WHOLE_WAY = 2.2
 """Limit of the lag over that of a shaft that stands; the latter is half of the way."""
 
@@ -54,6 +51,8 @@ class PositionDrive(TorqueDrive):
         times that, in any case.
     current_allowed_apk : float
         Rated current, or the drive's own limit or what it can show where that is smaller (A peak).
+    compared : ComparedSpeed
+        The speed that the drive shows, against that of its position.
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
 
@@ -90,8 +89,7 @@ class PositionDrive(TorqueDrive):
         self._taken: list[tuple[float, float, float, float]] = []
         self._recording = False
         self._start_counts = 0.0
-        self._speed = shown_speed(self.node)
-        self._speeds: list[tuple[float, float]] = []
+        self.compared = ComparedSpeed(self.node, self.counts_per_turn)
 
     def held_gains(self) -> dict[str, float]:
         """Return the gains of speed and position that the drive holds now, by their names; those of its map."""
@@ -170,30 +168,8 @@ class PositionDrive(TorqueDrive):
         return 2.0 * math.pi / abs(self.counts_per_turn)
 
     def look_at_speed(self) -> None:
-        """Note the speed as the drive shows it, where its unit is stated."""
-        if self._speed is not None:
-            began = self.node.connection.clock.now()
-            shown = self._speed.per_count * self.node.get(self._speed.item)
-            self._speeds.append((0.5 * (began + self.node.connection.clock.now()), shown))
-
-    def _speed_doubt(self, table: Array) -> str:
-        """Say where the speed that is shown is not that of the position; empty where it is, or nothing shows it."""
-        t, shown = np.array(self._speeds, dtype=np.float64).reshape(-1, 2).T
-        after, before = (
-            np.interp(t + half, table[:, 0], table[:, 1], math.nan, math.nan) for half in (SPEED_S / 2, -SPEED_S / 2)
-        )
-        seen = np.nan_to_num((after - before) / SPEED_S)
-        fast = np.abs(seen) > FAST_SHARE * np.max(np.abs(seen), initial=0.0)
-        if np.count_nonzero(fast) < LEAST_SPEEDS:
-            return ""
-        ratio = abs(float(shown[fast] @ seen[fast] / (seen[fast] @ seen[fast])))
-        if 1.0 / (1.0 + SPEED_AGREES) <= ratio <= 1.0 + SPEED_AGREES:
-            return ""
-        return (
-            f"the drive shows {ratio:.3g} times the speed of its position ({self._speed}): one of both has another "
-            f"unit than stated. {abs(self.counts_per_turn):.9g} units of position a turn are taken (0x608F, 0x6092, "
-            "or the map)"
-        )
+        """Compare the speed that the drive shows with that of the samples before."""
+        self.compared.look(self._taken)
 
     # ---- records --------------------------------------------------------------------------------
 
@@ -241,7 +217,7 @@ class PositionDrive(TorqueDrive):
             table[:, 0] - table[:1, 0],
             signals,
             units,
-            {"polled": not self.sends, "speed_doubt": self._speed_doubt(table) if len(table) else ""},
+            {"polled": not self.sends, "speed_doubt": self.compared.doubt},
         )
 
     def wait(self, seconds: float) -> None:
