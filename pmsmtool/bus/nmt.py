@@ -19,6 +19,8 @@ BOOT_TIMEOUT_S = 5.0
 NODES = range(1, 128)
 LISTEN_S = 0.3
 """Usual SDO time-out: a node that has not answered by then is slower than stock clients tolerate."""
+ASKED = 2
+"""Times all are asked where none answers: one lost frame is no missing drive."""
 _DEVICE_TYPE_REQUEST = b"\x40\x00\x10\x00\x00\x00\x00\x00"
 
 
@@ -114,9 +116,12 @@ def find_nodes(connection: Connection) -> list[FoundNode]:
     for cob_id, callback in subscriptions:
         connection.subscribe(cob_id, callback)
     try:
-        for node in NODES:
-            connection.send(0x600 + node, _DEVICE_TYPE_REQUEST)
-        connection.wait(LISTEN_S)
+        for _ in range(ASKED):
+            for node in NODES:
+                connection.send(0x600 + node, _DEVICE_TYPE_REQUEST)
+            connection.wait(LISTEN_S)
+            if types:
+                break
     finally:
         for cob_id, callback in subscriptions:
             connection.unsubscribe(cob_id, callback)

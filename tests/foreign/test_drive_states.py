@@ -11,6 +11,7 @@ import pytest
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connect import connect
+from pmsmtool.bus.nmt import find_nodes
 from pmsmtool.cia402 import State
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import WATCH_S, guarded
@@ -18,6 +19,8 @@ from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.drive.standard_drive import TorqueCurrent
 from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.shipped_maps import load_family
+from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.sim.line import Frame
 from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.node import Node
 from tests.foreign.data_sheets import Row, unknown, write_eds
@@ -73,3 +76,19 @@ def test_what_is_taken_in_some_states_only(
         drive.close()
         assert not power.state.energised
         assert {limit: find(limit, 0).read() for limit in before} == before
+
+
+def test_one_lost_answer_is_no_missing_drive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ "no drive answers", and the wiring as its cause, where one frame was lost."""
+    hear, lost = PmsmSimBus.hear, []
+
+    def hears(self: PmsmSimBus, frame: Frame, own: bool) -> None:
+        if not own and frame.can_id == 0x581 and not lost:
+            lost.append(frame)
+        else:
+            hear(self, frame, own)
+
+    monkeypatch.setattr(PmsmSimBus, "hear", hears)
+    eds = write_eds(tmp_path / "drive.eds", unknown())
+    with connect("pmsmsim", f"interior-2k2?nv=:memory:&eds={eds}") as connection:
+        assert [found.node for found in find_nodes(connection)] == [1] and lost
