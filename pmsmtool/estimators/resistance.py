@@ -473,7 +473,8 @@ def _fit_tail(
     # one row more: how much of V falls with the link is known about as well
     share = np.zeros((1, columns.shape[1]))
     share[0, [1, 4]] = -LINK_SHARE, 1.0
-    V_rough = abs(float(np.polyfit(np.abs(i), np.abs(v), 1)[1]))
+    off = u - np.mean(u)
+    V_rough = abs(float(np.mean(np.abs(v)) - np.mean(u) * (off @ np.abs(v)) / (off @ off)))
     weight = 1.0 / np.append(np.full_like(v, sigma_v), LINK_SHARE_STD * max(V_rough, sigma_v))
     x, covariance, residual, condition = linear_solve(np.vstack([columns, share]), np.append(v, 0.0), weight)
     return _TailFit(x, covariance, float(residual @ residual), len(residual) - len(x), condition)

@@ -23,10 +23,6 @@ from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
 
-FAST_POLE = 0.6
-"""Poles up to this are summed by their impulse response, at most 82 taps."""
-BLOCK_LOSS = 7.0
-"""Decay over one block of a slow pole (nepers): three decimal digits of the running sum."""
 FIRST_SAMPLE = 3
 """First sample that is modelled."""
 PULSE_CENTRES = (0.25, 0.75)
@@ -98,34 +94,10 @@ class Pulses:
 
 
 def recursion(pole: float, drive: Array, start: float) -> Array:
-    """Return x with x[0] = start and x[k+1] = pole x[k] + drive[k]; shape (n + 1,) for drive of shape (n,).
+    """Return x with x[0] = start and x[k+1] = pole x[k] + drive[k]; shape (n + 1,) for drive of shape (n,)."""
+    from scipy.signal import lfilter
 
-    Slow poles by scaled running sums in blocks that lose at most three digits, fast ones by their short impulse
-    response.
-    """
-    n = len(drive)
-    if pole <= FAST_POLE:
-        taps = min(n, 2 + int(math.log(1e-18) / math.log(max(pole, 1e-300))))
-        powers = pole ** np.arange(taps, dtype=np.float64)
-        out = np.empty(n + 1)
-        out[0] = start
-        out[1:] = np.convolve(drive, powers)[:n]
-        out[1 : taps + 1] += start * pole ** np.arange(1, min(taps, n) + 1, dtype=np.float64)
-        return out
-    rate = -math.log(pole)
-    block = n if abs(rate) * n < BLOCK_LOSS else max(1, int(BLOCK_LOSS / abs(rate)))
-    blocks = -(-n // block)
-    padded = np.zeros(blocks * block)
-    padded[:n] = drive
-    decay = np.exp(-rate * np.arange(block + 1, dtype=np.float64))
-    forced = np.cumsum(padded.reshape(blocks, block) / decay[1:], axis=1) * decay[1:]
-    out = np.empty(blocks * block + 1)
-    out[0] = carry = start
-    for index in range(blocks):
-        part = forced[index] + carry * decay[1:]
-        out[index * block + 1 : (index + 1) * block + 1] = part
-        carry = float(part[-1])
-    return out[: n + 1]
+    return np.append(start, lfilter([1.0], [1.0, -pole], drive, zi=[pole * start])[0])
 
 
 def acting_voltages(command: Array, delay: float) -> tuple[Array, Array, float]:

@@ -124,7 +124,8 @@ class Problem:
                 plus = x.copy()
                 plus[column] += self.step[column]
                 block[:, column] = (self._off(k, plus) - here) / (plus[column] - x[column])
-            for column in (*range(first), self.shared + 2 * k, self.shared + 2 * k + 1):
+            block[:, self.shared + 2 * k] = 1.0  # the first position
+            for column in (*range(first), self.shared + 2 * k + 1):
                 plus, minus = x.copy(), x.copy()
                 plus[column] += self.step[column]
                 minus[column] -= self.step[column]
@@ -136,14 +137,15 @@ class Problem:
 
 def whitener(run: Run, J: float) -> Array:
     """Return the inverse of the Cholesky factor of the position residual's covariance."""
+    from scipy.linalg.lapack import dtrtri  # a third of the time of numpy's inverse
+
     n = len(run.theta)
     if run.torque_std == 0.0:
         return np.diag(1.0 / run.theta_std)
     lag = np.arange(n)[:, None] - np.arange(n - 1)[None, :] - 0.5
     G = np.maximum(lag, 0.0) * run.T**2 / J
     covariance = np.diag(run.theta_std**2) + run.torque_std**2 * (G @ G.T)
-    factor = np.linalg.cholesky(covariance)
-    return np.asarray(np.linalg.inv(factor))
+    return np.asarray(dtrtri(np.linalg.cholesky(covariance), lower=1)[0])
 
 
 def positions(torque: Array, T: float, x: Array) -> Array:
