@@ -190,7 +190,7 @@ def test_every_refused_file_comes_with_a_next_step(name: str, tmp_path: Path) ->
 
 
 READERS = (
-    "machine/machine_file", "machine/flux_map_import", "machine/flux_map_table", "machine/mat_file", "trace_file",
+    "machine/machine_file", "machine/flux_map_import", "machine/mat_file", "trace_file",
     "sim/scenarios", "sim/faults", "sim/channel", "sim/simulated_machine", "drive_maps/dcf", "drive_maps/eds",
     "drive_maps/drive_map_file", "drive_maps/drive_map", "params/parameter_set", "design/design_file",
     "proof/prediction_file", "machine/iron_loss_map", "design/lookup/file", "npz_file", "toml_file", "flash/journal",

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 STAGES = ("identify", "tune", "lut", "margins", "flash", "verify", "prove")
 LIMITS = ("current", "speed")
-"""As in ``commissioning.commission`` and ``commissioning.rated_limits``, which take too long to import for
+"""As in ``commissioning.commission`` and ``commissioning.closed_stage``, which take too long to import for
 ``--help``."""
 
 
