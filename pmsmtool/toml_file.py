@@ -36,13 +36,6 @@ _NAME_PART = re.compile(r""""([^"]*)"|'([^']*)'|([A-Za-z0-9_-]+)""")
 def parse_toml(text: str, *, where: str) -> dict[str, Any]:
     """Return the tables of a TOML text.
 
-    Parameters
-    ----------
-    text : str
-        The document.
-    where : str
-        Named in errors.
-
     Raises
     ------
     ConfigError

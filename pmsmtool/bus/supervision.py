@@ -71,13 +71,6 @@ class Emergency:
 class Supervision:
     """What is known about one node from the frames it and others send.
 
-    Parameters
-    ----------
-    connection : Connection
-        The bus.
-    node : int
-        Node id.
-
     Attributes
     ----------
     heartbeat_period_s : float or None

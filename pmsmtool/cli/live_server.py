@@ -52,13 +52,6 @@ GOODBYE_S = 1.0
 class Samples:
     """The latest samples of some signals.
 
-    Parameters
-    ----------
-    names : sequence of str
-        The signals.
-    rows : int
-        Samples that are kept.
-
     Raises
     ------
     ConfigError

@@ -36,13 +36,7 @@ BUSY_S = 5.0
 
 
 class ChangedObjects:
-    """Notes the content of every object before its first change, and brings it back.
-
-    Parameters
-    ----------
-    drive : CanopenDrive
-        The drive that is lent.
-    """
+    """Notes the content of every object before its first change, and brings it back."""
 
     def __init__(self, drive: CanopenDrive) -> None:
         self._drive = drive

@@ -58,13 +58,7 @@ def _no_progress(done: int, total: int) -> None:
 
 
 class DriveParameters:
-    """Access to the parameters of one drive.
-
-    Parameters
-    ----------
-    node : DriveNode
-        The drive.
-    """
+    """Access to the parameters of one drive."""
 
     def __init__(self, node: DriveNode) -> None:
         self.node = node

@@ -201,15 +201,7 @@ def _ramp_s(node: DriveNode, option: QuickStop | None) -> float:
 
 
 class _Falling:
-    """Watches the speed while a drive brakes.
-
-    Parameters
-    ----------
-    node : DriveNode
-        The drive.
-    say : callable
-        Told the speed as it falls.
-    """
+    """Watches the speed while a drive brakes."""
 
     def __init__(self, node: DriveNode, say: Callable[[str], None]) -> None:
         self._node = node

@@ -124,13 +124,7 @@ class VendorTuning:
         return frozenset(RESULTS[name] for name in self.results)
 
     def steps_for(self, quantities: frozenset[str], *, turning: bool) -> tuple[VendorStep, ...]:
-        """Return the steps that tell the quantities, with what they use and all checks, in order.
-
-        Parameters
-        ----------
-        turning : bool
-            Whether the shaft may turn.
-        """
+        """Return the steps that tell the quantities, with what they use and all checks, in order."""
         wanted = {name for name in self.results if RESULTS[name] in quantities}
         for step in reversed(tuple(self.steps.values())):
             if step.name in wanted:

@@ -53,13 +53,7 @@ class ImageStatus(IntEnum):
 
 
 class ImageRefused(ConfigError):
-    """An image, or the values for one, cannot be used.
-
-    Parameters
-    ----------
-    status : ImageStatus
-        The reason, in the drive's own numbering.
-    """
+    """An image, or the values for one, cannot be used."""
 
     def __init__(
         self, status: ImageStatus, what: str, *, violations: tuple[str, ...] = (), likely: str = "", hint: str = ""

@@ -72,13 +72,7 @@ def vendor_facts(name: str, estimate: Estimate) -> dict[str, Any]:
 
 
 def vendor_machine(known: tuple[MachineFile, str] | None, found: Mapping[str, Estimate]) -> CompletedMachine:
-    """Put the drive's own values into a machine that is known otherwise.
-
-    Parameters
-    ----------
-    known : MachineFile and its source, optional
-        What completes them.
-    """
+    """Put the drive's own values into a machine that is known otherwise."""
     if known is None:
         return CompletedMachine(None, (), ("no machine file is written: it needs ratings and the inverter, too",))
     given_file, source = known

@@ -123,13 +123,7 @@ def inductance_figure(shots: Mapping[str, Trace], fits: Mapping[str, AxisFit], s
 
 
 def flux_figure(result: FluxResult) -> Figure:
-    """Draw the voltage of the magnets over speed, and how far each pair of windows lies off the common flux linkage.
-
-    Parameters
-    ----------
-    result : FluxResult
-        The regression.
-    """
+    """Draw the voltage of the magnets over speed, and how far each pair of windows lies off the common flux linkage."""
     w, residual, psi = result.omega_rad_s, result.residual_wb, result.psi_measured.value
     canvas, (left, right) = _canvas(1, 2)
     order = np.argsort(w)
@@ -316,13 +310,7 @@ def bands_figure(groups: Mapping[str, Mapping[str, tuple[float, float, float, fl
 
 
 def margin_figure(report: MarginReport) -> Figure:
-    """Draw margins and headroom from the worst corner to the 95 % quantile, else the nominal value; no delay margins.
-
-    Parameters
-    ----------
-    report : MarginReport
-        Of ``margin_report``.
-    """
+    """Draw margins and headroom from the worst corner to the 95 % quantile, else the nominal value; no delay margins."""
     groups: dict[str, dict[str, tuple[float, float, float, float]]] = {}
     for spread in (row for row in (*report.loops, *report.headroom) if row.unit != "us"):
         high = spread.percentiles.get(95.0, spread.nominal)

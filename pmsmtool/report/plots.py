@@ -61,15 +61,6 @@ PANELS: tuple[Panel, ...] = (
 def trace_figure(trace: Trace, panels: Sequence[Panel] = PANELS, title: str = "") -> Figure:
     """Return a figure of a trace, one panel below the other over the same time.
 
-    Parameters
-    ----------
-    trace : Trace
-        With some of the panels' signals.
-    panels : sequence of Panel
-        What to draw.
-    title : str
-        Heading.
-
     Raises
     ------
     ValueError

@@ -25,15 +25,7 @@ VOLTAGE_DIGITS = ((100.0, 0.01), (np.inf, 0.1))
 
 
 class BenchSupply:
-    """One supply.
-
-    Parameters
-    ----------
-    core : KernelCore
-        The drive it feeds.
-    seed : int
-        Seed of its gains.
-    """
+    """One supply."""
 
     def __init__(self, core: KernelCore, seed: int) -> None:
         self._simulation = core.simulation

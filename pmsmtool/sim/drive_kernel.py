@@ -57,13 +57,6 @@ IDEAL_ENCODER_COUNTS = 1 << 24
 class KernelCore:
     """A drive's application with its machine, as the node sees it.
 
-    Parameters
-    ----------
-    machine_file : MachineFile
-        Machine and ``[simulation]``.
-    seed : int
-        Seed of the noise.
-
     Attributes
     ----------
     simulation : Simulation

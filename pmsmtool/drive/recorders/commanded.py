@@ -29,11 +29,6 @@ _Row = TypeVar("_Row")
 class CommandedRecorder(Recorder):
     """A recorder that a drive's map describes.
 
-    Parameters
-    ----------
-    node : DriveNode
-        The drive, with its map.
-
     Raises
     ------
     NotAvailable

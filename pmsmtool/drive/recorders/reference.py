@@ -29,15 +29,7 @@ _TRIGGER_NOW, _TRIGGER_EXCITATION, _TRIGGER_MOVE = 0, 4, 6
 
 
 class Recorder:
-    """Recorder and averages of one drive.
-
-    Parameters
-    ----------
-    node : DriveNode
-        The drive.
-    period_s : float
-        Control period (s).
-    """
+    """Recorder and averages of one drive."""
 
     def __init__(self, node: DriveNode, period_s: float) -> None:
         self._node = node

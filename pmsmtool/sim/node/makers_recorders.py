@@ -38,15 +38,6 @@ class Rings(RecorderFace):
 
     Its period is counted in the map's unit and need not be a multiple of the control period: a sample is what the drive
     last held at its instant. It stops by itself when the rings are full; before, the buffer is being written.
-
-    Parameters
-    ----------
-    drive_map : DriveMap
-        The family; its channels are the objects that can be recorded.
-    dictionary : Dictionary
-        Dressed as the family's.
-    plant : Plant
-        The drive behind.
     """
 
     def __init__(self, drive_map: DriveMap, dictionary: Dictionary, plant: Plant) -> None:
@@ -166,15 +157,6 @@ class Monitor(RecorderFace):
     """The monitor of an Ingenia drive, objects 0x58B0 to 0x58F3: rows of REAL32 in the family's units.
 
     Reading the data register takes a block of 512 bytes out of the memory, whether its answer arrives or not.
-
-    Parameters
-    ----------
-    drive_map : DriveMap
-        The family; its signals can be mapped.
-    dictionary : Dictionary
-        Dressed as the family's.
-    plant : Plant
-        The drive behind.
     """
 
     def __init__(self, drive_map: DriveMap, dictionary: Dictionary, plant: Plant) -> None:
@@ -265,15 +247,6 @@ class TraceRows(RecorderFace):
 
     It runs until its memory is full or it is stopped. Data read while it runs are torn: the row being written is half
     old.
-
-    Parameters
-    ----------
-    drive_map : DriveMap
-        The family; its channels are the variables there are.
-    dictionary : Dictionary
-        Dressed as the family's.
-    plant : Plant
-        The drive behind.
     """
 
     def __init__(self, drive_map: DriveMap, dictionary: Dictionary, plant: Plant) -> None:

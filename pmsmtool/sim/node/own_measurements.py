@@ -83,13 +83,7 @@ AT_PROGRESS, PER_S = 100, 10.0
 
 
 class MeasurementFailed(Exception):
-    """A measurement that ends without a result.
-
-    Parameters
-    ----------
-    code : int
-        Error code of the drive.
-    """
+    """A measurement that ends without a result, by its error code in the drive."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"error code {code}")
