@@ -51,10 +51,8 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     What the archive announces is added up before anything is unpacked: every number counts 8 bytes, which is what it
     takes once it is computed with.
 
-    Raises
-    ------
-    ConfigError
-        Missing, too large, truncated, not an archive, or holding Python objects (which are never executed).
+    Raises ConfigError: missing, too large, truncated, not an archive, or holding Python objects (which are never
+    executed).
     """
     where = str(path)
     content = read_bytes(path, largest=NUMBERS_BYTES)

@@ -24,10 +24,7 @@ def data_folder(name: DataFolder) -> Path:
 
     A wheel carries them inside the package, a checkout (also one installed with ``pip install -e``) at its top.
 
-    Raises
-    ------
-    PmsmtoolError
-        The folder is in neither place.
+    Raises PmsmtoolError: the folder is in neither place.
     """
     bundled = _PACKAGE / BUNDLE / name
     if bundled.is_dir():
@@ -48,10 +45,7 @@ def user_folder() -> Path:
 
     ``PMSMTOOL_HOME`` if set, else the platform's place for application data.
 
-    Raises
-    ------
-    ConfigError
-        The user has no home folder (a container with a bare user number).
+    Raises ConfigError: the user has no home folder (a container with a bare user number).
     """
     chosen = os.environ.get("PMSMTOOL_HOME")
     if chosen:

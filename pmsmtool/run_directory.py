@@ -132,10 +132,7 @@ class RunDirectory:
     def create(cls, parent: Path, serial: int, record: RunRecord) -> RunDirectory:
         """Make ``parent/<utc>-<serial>`` with its record; a second run in the same second gets a suffix.
 
-        Raises
-        ------
-        ConfigError
-            If the directory cannot be made or written.
+        Raises ConfigError: if the directory cannot be made or written.
         """
         stem = f"{record.started_utc.replace(':', '').replace('-', '')}-{serial:08x}"
         for attempt in range(100):
@@ -156,13 +153,7 @@ class RunDirectory:
         )
 
     def read(self) -> RunRecord:
-        """Return the record.
-
-        Raises
-        ------
-        ConfigError
-            If there is no record, or it is not one of ours.
-        """
+        """Return the record. Raises ConfigError: if there is no record, or it is not one of ours."""
         path = self.path / RECORD
         hint = "give a directory that identify or commission made"
         if not path.exists():

@@ -34,13 +34,7 @@ _NAME_PART = re.compile(r""""([^"]*)"|'([^']*)'|([A-Za-z0-9_-]+)""")
 
 @next_step(NEXT_STEP)
 def parse_toml(text: str, *, where: str) -> dict[str, Any]:
-    """Return the tables of a TOML text.
-
-    Raises
-    ------
-    ConfigError
-        Not TOML, or a whole number beyond 64 bit.
-    """
+    """Return the tables of a TOML text. Raises ConfigError: not TOML, or a whole number beyond 64 bit."""
     try:
         tables = tomllib.loads(text.removeprefix("\ufeff"))  # Windows editors begin UTF-8 with this mark
     except (ValueError, RecursionError) as error:  # beside its own error: numbers of 5000 digits, brackets 1000 deep
@@ -54,13 +48,7 @@ def parse_toml(text: str, *, where: str) -> dict[str, Any]:
 
 
 def read_toml(path: Path, *, hint: str = "check the path") -> dict[str, Any]:
-    """Return the tables of a TOML file.
-
-    Raises
-    ------
-    ConfigError
-        Missing, unreadable, or as :func:`parse_toml`.
-    """
+    """Return the tables of a TOML file. Raises ConfigError: missing, unreadable, or as :func:`parse_toml`."""
     return parse_toml(read_text(path, hint=hint), where=str(path))
 
 

@@ -48,13 +48,7 @@ class Recorded(dict[str, Any]):
         self.where = where
 
     def __missing__(self, name: str) -> Any:
-        """Name the file and what it has not.
-
-        Raises
-        ------
-        ConfigError
-            Always.
-        """
+        """Name the file and what it has not. Raises ConfigError: always."""
         raise ConfigError(
             f"the record has no {self.kind} {name}",
             where=self.where,
@@ -66,10 +60,7 @@ class Recorded(dict[str, Any]):
 def write_trace(trace: Trace, path: Path) -> None:
     """Write a trace by suffix, ``.npz`` or ``.csv``, replacing the file at once.
 
-    Raises
-    ------
-    ConfigError
-        Another suffix, or the file cannot be written.
+    Raises ConfigError: another suffix, or the file cannot be written.
     """
     suffix = path.suffix.lower()
     if suffix not in (".npz", ".csv"):

@@ -263,10 +263,7 @@ _CURRENT = re.compile(r"([munpkMG\u00b5\u03bc]?) ?A ?(pk|peak|rms|eff)?")
 def parse_current(text: str) -> float:
     """Return a current as its amplitude (A peak); the text must say ``Apk`` or ``Arms``.
 
-    Raises
-    ------
-    ConfigError
-        The kind is missing: peak and rms differ by 41 %, so it is never guessed.
+    Raises ConfigError: the kind is missing: peak and rms differ by 41 %, so it is never guessed.
     """
     value, spelled = _split(text, _EXAMPLES["A"])
     match = _CURRENT.fullmatch(spelled)

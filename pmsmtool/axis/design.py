@@ -423,10 +423,7 @@ def profile_within(design: Design, torque_nm: float) -> Profile:
 
     The same share of what it gives beyond friction accelerates, in ramps of the same time.
 
-    Raises
-    ------
-    DesignInfeasible
-        Friction takes the whole torque.
+    Raises DesignInfeasible: friction takes the whole torque.
     """
     source, facts = design.machine, design.facts
     speed, acceleration, jerk = (

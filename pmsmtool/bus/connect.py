@@ -81,10 +81,7 @@ def connect(
 def _open_in_time(arguments: dict[str, Any], interface: str | None) -> can.BusABC:
     """Open a bus; python-can's back ends may wait for ever for a driver, or for a server's first word.
 
-    Raises
-    ------
-    TimeoutError
-        It did not open within ``OPEN_LIMIT_S``.
+    Raises TimeoutError: it did not open within ``OPEN_LIMIT_S``.
     """
     if interface == "pmsmsim":
         return can.Bus(**arguments)  # in this process; its clock belongs to this thread

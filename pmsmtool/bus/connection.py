@@ -195,10 +195,7 @@ class Connection:
     def request(self, cob_id: int, length: int) -> None:
         """Send a remote frame, once: it is asked again soon.
 
-        Raises
-        ------
-        BusError
-            The adapter is gone, nobody acknowledges, or it sends no remote frames.
+        Raises BusError: the adapter is gone, nobody acknowledges, or it sends no remote frames.
         """
         message = can.Message(arbitration_id=cob_id, is_remote_frame=True, dlc=length, is_extended_id=False)
         try:

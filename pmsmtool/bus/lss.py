@@ -92,13 +92,7 @@ class LssMaster:
         return LssAddress(*numbers)
 
     def select(self, address: LssAddress) -> None:
-        """Put the slave with an identity into the configuration state.
-
-        Raises
-        ------
-        DriveTimeout
-            No slave has it.
-        """
+        """Put the slave with an identity into the configuration state. Raises DriveTimeout: no slave has it."""
         parts = (address.vendor, address.product, address.revision, address.serial)
         for offset, number in enumerate(parts):
             self._send(LssCommand.SELECT_VENDOR + offset, number.to_bytes(4, "little"))
@@ -107,10 +101,7 @@ class LssMaster:
     def set_node_id(self, node: int) -> None:
         """Give the selected slave a node id (1..127; 255: none); it takes it when the configuration state is left.
 
-        Raises
-        ------
-        DriveFault
-            It refuses the id.
+        Raises DriveFault: it refuses the id.
         """
         self._send(LssCommand.SET_NODE_ID, bytes((node,)))
         answer = self._await(LssCommand.SET_NODE_ID, TIMEOUT_S, "the node id")
@@ -118,13 +109,7 @@ class LssMaster:
             raise DriveFault(f"the slave refuses node id {node} (error {answer[1]})", hint="choose 1..127")
 
     def store(self) -> None:
-        """Make the selected slave keep its node id over a power-off.
-
-        Raises
-        ------
-        DriveFault
-            It cannot.
-        """
+        """Make the selected slave keep its node id over a power-off. Raises DriveFault: it cannot."""
         self._send(LssCommand.STORE)
         answer = self._await(LssCommand.STORE, STORE_TIMEOUT_S, "storing")
         if answer[1]:

@@ -49,13 +49,7 @@ def send_nmt(connection: Connection, command: NmtCommand, node: int) -> None:
 
 
 def reset_node(connection: Connection, node: int, *, timeout_s: float = BOOT_TIMEOUT_S) -> None:
-    """Reset a node and return when its boot-up message came.
-
-    Raises
-    ------
-    DriveTimeout
-        No boot-up within ``timeout_s``.
-    """
+    """Reset a node and return when its boot-up message came. Raises DriveTimeout: no boot-up within ``timeout_s``."""
     boots: list[float] = []
 
     def heard(cob_id: int, data: bytes, timestamp: float) -> None:

@@ -156,10 +156,7 @@ class Supervision:
     def check(self) -> None:
         """Raise what makes further work on the node pointless.
 
-        Raises
-        ------
-        NodeReset, HeartbeatLost, SecondMaster, DriveFault
-            Each once per occurrence.
+        Raises NodeReset, HeartbeatLost, SecondMaster, DriveFault: each once per occurrence.
         """
         if self._paused:
             return

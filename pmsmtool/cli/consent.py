@@ -66,10 +66,7 @@ def missing_for_yes(options: MotionOptions, subject: Subject = "motion") -> list
 def refuse_unattended(option: str, names: Iterable[str], options: MotionOptions, *, simulated: bool) -> None:
     """Refuse an ``--accept-...`` option together with ``--yes`` on a real bus: a person accepts, not a script.
 
-    Raises
-    ------
-    ConfigError
-        Both are given, and the bus is not the simulated drive.
+    Raises ConfigError: both are given, and the bus is not the simulated drive.
     """
     if list(names) and options.yes and not simulated:
         raise ConfigError(

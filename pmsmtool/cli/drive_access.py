@@ -165,12 +165,8 @@ def warn_of_other_drive(node: DriveNode, out: Output) -> None:
 def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[CanopenDrive]:
     """Open the bus and the drive on it, ready for experiments.
 
-    Raises
-    ------
-    ConfigError
-        The map is that of another drive: nothing is moved through it.
-    NotAvailable
-        The drive lacks the reference drive's objects.
+    Raises ConfigError: the map is that of another drive: nothing is moved through it; NotAvailable: the drive lacks the
+    reference drive's objects.
     """
     from pmsmtool.drive.canopen_drive import CanopenDrive
     from pmsmtool.errors import NotAvailable, SdoAbort
@@ -194,12 +190,8 @@ def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[C
 def claimed_node(connection: Connection, node: int | None) -> int:
     """Return the node id to use, as :func:`choose_node`, its drive locked until the connection is closed.
 
-    Raises
-    ------
-    SecondMaster
-        Another program works with the drive.
-    SafetyRefusal
-        What an interrupted run left changed cannot be restored.
+    Raises SecondMaster: another program works with the drive; SafetyRefusal: what an interrupted run left changed
+    cannot be restored.
     """
     from pmsmtool.drive.drive_lock import claim
 
@@ -230,15 +222,7 @@ def _restore_left(connection: Connection, node_id: int) -> None:
 
 
 def choose_node(connection: Connection, node: int | None) -> int:
-    """Return the node id to use.
-
-    Raises
-    ------
-    BusError
-        No drive answers.
-    ConfigError
-        Several do, and none was named.
-    """
+    """Return the node id to use. Raises BusError: no drive answers; ConfigError: several do, and none was named."""
     from pmsmtool.bus.nmt import find_nodes
 
     if node is not None:

@@ -73,10 +73,7 @@ class Comparison:
 def earlier_run(path: Path, quantities: Sequence[str], method: str) -> tuple[Earlier, tuple[str, ...]]:
     """Return an earlier run and what of the quantities is asked to be compared.
 
-    Raises
-    ------
-    ConfigError
-        It cannot be compared with: damaged, without these values, or of another level than ``method``.
+    Raises ConfigError: it cannot be compared with: damaged, without these values, or of another level than ``method``.
     """
     from pmsmtool.errors import ConfigError
     from pmsmtool.identification.fingerprint import QUANTITIES, read_earlier

@@ -90,10 +90,7 @@ def write_plan(
 def checked_identity(node: DriveNode, out: Output) -> Identity:
     """Read the identity, refuse a drive the map is not for, and say where no source of the map knows its firmware.
 
-    Raises
-    ------
-    ConfigError
-        Vendor or product are not the map's.
+    Raises ConfigError: vendor or product are not the map's.
     """
     from pmsmtool.flash.map_gate import check_family, unknown_firmware
 

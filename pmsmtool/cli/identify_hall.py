@@ -28,12 +28,7 @@ TRACE = "traces/hall.npz"
 def identify_hall(bus: BusOptions, motion: MotionOptions, out: Output, runs: Path, drive_map: DriveMap) -> None:
     """Turn the rotor over an electrical turn both ways, and say how the Hall sensors are wired and placed.
 
-    Raises
-    ------
-    NotAvailable
-        The drive shows no Hall wires.
-    IdentificationError
-        E_HALL.
+    Raises NotAvailable: the drive shows no Hall wires; IdentificationError: E_HALL.
     """
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.drive import objects

@@ -34,10 +34,7 @@ def jsonable(value: Any) -> Any:
     Dataclasses become objects, arrays lists, numbers stay SI numbers without formatting; what is not a finite
     number becomes null, because JSON has no other word for it.
 
-    Raises
-    ------
-    TypeError
-        A type that has no obvious JSON form.
+    Raises TypeError: a type that has no obvious JSON form.
     """
     if isinstance(value, enum.Flag):
         return jsonable(value.value)
@@ -202,10 +199,7 @@ def set_up_logging(verbosity: int) -> None:
 def save_figure(figure: Figure, path: Path) -> None:
     """Save a figure in the format of the suffix, the same bytes for the same figure.
 
-    Raises
-    ------
-    ConfigError
-        A suffix matplotlib does not know, or a file that cannot be written.
+    Raises ConfigError: a suffix matplotlib does not know, or a file that cannot be written.
     """
     import io
 

@@ -218,13 +218,7 @@ _Entry = tuple[str, tuple[int, int]]
 
 
 def _resolve(text: str, drive_map: DriveMap) -> list[_Entry]:
-    """Return what a name, a wildcard or an object means.
-
-    Raises
-    ------
-    ConfigError
-        Nothing has that name.
-    """
+    """Return what a name, a wildcard or an object means. Raises ConfigError: nothing has that name."""
     from pmsmtool.errors import ConfigError
 
     address = _ADDRESS.fullmatch(text)

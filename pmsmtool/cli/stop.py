@@ -43,12 +43,7 @@ def stop_command(bus: BusOptions, out: Output, everyone: bool) -> None:
 def _whom(connection: Connection, node: int | None, everyone: bool) -> list[int]:
     """Return the nodes to stop.
 
-    Raises
-    ------
-    StopNotConfirmed
-        None answers.
-    ConfigError
-        Several do, and neither one nor all were asked for.
+    Raises StopNotConfirmed: none answers; ConfigError: several do, and neither one nor all were asked for.
     """
     from pmsmtool.bus.nmt import find_nodes
     from pmsmtool.cli.drive_access import choose_node

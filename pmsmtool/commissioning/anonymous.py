@@ -77,10 +77,7 @@ class _Names:
 def anonymous_text(path: Path) -> str:
     """Return the file of a run: JSON, the same bytes for the same run.
 
-    Raises
-    ------
-    ConfigError
-        There is no run in the folder, or one of its files is damaged.
+    Raises ConfigError: there is no run in the folder, or one of its files is damaged.
     """
     return json.dumps(anonymous_run(path), indent=1, allow_nan=False) + "\n"
 

@@ -56,12 +56,8 @@ def design_axis(
 ) -> Design:
     """Design the axis of a machine on a drive; with what the drive holds, never for a larger following error than that.
 
-    Raises
-    ------
-    ConfigError
-        The machine file has no inertia, or gains do not fit the drive's types.
-    DesignInfeasible
-        No gains keep the margins over the tolerance box.
+    Raises ConfigError: the machine file has no inertia, or gains do not fit the drive's types; DesignInfeasible: no
+    gains keep the margins over the tolerance box.
     """
     drive = axis_drive(drive_map)
     made = with_axis(tune(source, request), axis, drive)

@@ -77,12 +77,7 @@ def closed_stage(run: RunDirectory, request: TuneRequest, drive_map: DriveMap, b
 
     Where no limits can be designed the gains are designed without, and the stage says why.
 
-    Raises
-    ------
-    ConfigError
-        The bandwidth is no positive number.
-    DesignInfeasible
-        The margins asked for cannot be met.
+    Raises ConfigError: the bandwidth is no positive number; DesignInfeasible: the margins asked for cannot be met.
     """
     reason = why_no_limits(drive_map, bandwidth_hz, load_machine_file(run.path / "machine.toml"))
     if not reason:

@@ -82,10 +82,7 @@ def proof_within(asked: IdentifyRequest) -> ProofRequest:
 def due_stages(run: RunDirectory, record: RunRecord) -> tuple[str, ...]:
     """Return the stages still to be run: from the first that has not passed, or whose files are gone, to the last.
 
-    Raises
-    ------
-    ConfigError
-        A file is not what its stage left.
+    Raises ConfigError: a file is not what its stage left.
     """
     expected: dict[str, str] = {}
     position = -1
@@ -183,12 +180,8 @@ class Commissioning:
     def carry_out(self) -> None:
         """Run what is due.
 
-        Raises
-        ------
-        PmsmtoolError
-            Whatever ended the chain; it is recorded.
-        StopNotConfirmed
-            The machine may be energised; outranks whatever ended the chain.
+        Raises PmsmtoolError: whatever ended the chain; it is recorded; StopNotConfirmed: the machine may be energised;
+        outranks whatever ended the chain.
         """
         check_accepted(self.accept_contradictions)
         record = self.run.read()

@@ -29,12 +29,8 @@ _KEYS = {"encoder_counts": "[encoder] bits", "J_per_psi": "J_kgm2 or psi_f_wb", 
 def check_accepted(names: Collection[str]) -> None:
     """Refuse contradictions that nobody may accept.
 
-    Raises
-    ------
-    ConfigError
-        A name of no quantity.
-    SafetyRefusal
-        A quantity that limits are computed from, or that decides how the machine commutates.
+    Raises ConfigError: a name of no quantity; SafetyRefusal: a quantity that limits are computed from, or that decides
+    how the machine commutates.
     """
     unknown = [name for name in names if name not in ORDER and name not in _NEVER]
     if unknown:
@@ -118,10 +114,7 @@ def compared(
 def refuse_inertia(known: MachineFile, ratio: Estimate, run: RunDirectory) -> None:
     """Refuse J over psi of moves that is less than MACHINE allows; a load may add any amount.
 
-    Raises
-    ------
-    Contradiction
-        The drive counts its current in another unit, or the machine file is that of another motor.
+    Raises Contradiction: the drive counts its current in another unit, or the machine file is that of another motor.
     """
     value = {"name": RATIO, "value": ratio.value, "std": ratio.std, "total_95": total_half_width(ratio)}
     (row,) = (row for row in compare(known, {}, [value], loaded=True) if row.name == RATIO)

@@ -43,10 +43,7 @@ def tune_stage(run: RunDirectory, request: TuneRequest, designed: Designed = tun
 
     Not available where the drive takes no gains: then nothing of the loops is judged.
 
-    Raises
-    ------
-    DesignInfeasible
-        The margins asked for cannot be met.
+    Raises DesignInfeasible: the margins asked for cannot be met.
     """
     design = designed(load_machine_file(run.path / "machine.toml"), request)
     run.save("design.toml", design_text(design))
@@ -131,10 +128,7 @@ def lut_stage(run: RunDirectory, request: LookupRequest) -> Stage:
     Writes ``lut.npz``, ``lut.csv``, the design with it, and ``params.toml``, the set that is flashed. The table goes
     into the drive when the design takes its references from one (``field_weakening.mode``).
 
-    Raises
-    ------
-    DesignInfeasible
-        Not even a table within the widest of ``lookup.design.BOUNDS`` fits the drive's memory.
+    Raises DesignInfeasible: not even a table within the widest of ``lookup.design.BOUNDS`` fits the drive's memory.
     """
     design = load_design(run.path / "design.toml")
     made = design_table(design.machine, ratings_of(design), request, design["field_weakening.margin"])
@@ -172,10 +166,7 @@ def _at_most(what: str, value: float, largest: float) -> Acceptance:
 def margins_stage(run: RunDirectory, request: MarginRequest) -> Stage:
     """Judge the design over what the machine may be: interval corners and random samples; writes nothing.
 
-    Raises
-    ------
-    NotAvailable
-        The drive takes no gains, so there is no loop to judge.
+    Raises NotAvailable: the drive takes no gains, so there is no loop to judge.
     """
     design = load_design(run.path / "design.toml")
     if reason := why_not_judged(design):

@@ -48,10 +48,7 @@ def checked(wanted: ParameterSet) -> ParameterSet:
 def image_of(wanted: ParameterSet) -> bytes:
     """Return the packed image of a complete set (object 0x2001), look-up words included.
 
-    Raises
-    ------
-    ConfigError
-        Parameters are missing or out of bounds, or the tables do not fit their descriptor.
+    Raises ConfigError: parameters are missing or out of bounds, or the tables do not fit their descriptor.
     """
     checked(wanted)
     tables = {name: encode_table(name, table, wanted.values) for name, table in wanted.tables.items()}
@@ -114,10 +111,7 @@ def concise_dcf(wanted: ParameterSet, *, drive_map: DriveMap | None = None) -> b
     and only if its CRC-32 is right. An incomplete set has no CRC of its own and is written directly; the look-up
     table cannot be written that way.
 
-    Raises
-    ------
-    ConfigError
-        Values that do not fit, or a look-up table in an incomplete set.
+    Raises ConfigError: values that do not fit, or a look-up table in an incomplete set.
     """
     drive_map = drive_map or reference_map()
     entries = [Entry(*drive_map.address(name), data) for name, data in drive_map.encode(checked(wanted)).items()]

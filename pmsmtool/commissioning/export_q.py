@@ -55,10 +55,8 @@ def _power_of_two(x: float) -> float:
 def q_format(values: Mapping[str, float]) -> QFormat:
     """Return bases and constants of a complete set of catalogue values.
 
-    Raises
-    ------
-    ConfigError
-        A constant does not fit Q4.27, or the current controller works without decoupling or emf feed-forward.
+    Raises ConfigError: a constant does not fit Q4.27, or the current controller works without decoupling or emf
+    feed-forward.
     """
     if int(values["current.options"]) & DECOUPLING_AND_EMF != DECOUPLING_AND_EMF:
         raise ConfigError(

@@ -31,12 +31,8 @@ Consent = Callable[[Sequence[str]], None]
 def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: Say) -> Stage:
     """Write ``params.toml`` to the drive and store it, with journal and roll-back.
 
-    Raises
-    ------
-    Declined
-        The person did not agree to the differences; nothing was written.
-    PmsmtoolError
-        The download failed; the error says which set the drive holds.
+    Raises Declined: the person did not agree to the differences; nothing was written; PmsmtoolError: the download
+    failed; the error says which set the drive holds.
     """
     wanted = read_parameter_set(run.path / "params.toml")
     folder = JournalFolder(drive.identity)

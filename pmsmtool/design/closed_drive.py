@@ -204,12 +204,8 @@ class Guarantee:
 def tune_closed(source: MachineFile, request: TuneRequest, drive: ClosedDrive) -> tuple[Design, Guarantee]:
     """Design a closed drive: gains as far as it takes them, and the limits that keep it out of saturation.
 
-    Raises
-    ------
-    ConfigError
-        What is needed and not known: bandwidth of a drive whose gains cannot be written, inertia or acceleration.
-    DesignInfeasible
-        No torque is admissible, not even at the lowest speeds.
+    Raises ConfigError: what is needed and not known: bandwidth of a drive whose gains cannot be written, inertia or
+    acceleration; DesignInfeasible: no torque is admissible, not even at the lowest speeds.
     """
     unheld = tune(source, replace(request, controller="pi", governor="off", field_weakening="off", predictor=False))
     design = _as_controlled(unheld, drive)

@@ -198,10 +198,8 @@ def load_machine_or_design(source: str | Path | Design | MachineFile) -> tuple[M
 def parse_design(text: str, *, where: str = "design.toml") -> Design:
     """Read the text of a design.
 
-    Raises
-    ------
-    ConfigError
-        Not TOML, another schema, unknown or missing values, or a machine that was changed after the design.
+    Raises ConfigError: not TOML, another schema, unknown or missing values, or a machine that was changed after the
+    design.
     """
     tables = parse_toml(text, where=where)
     schema = tables.get("schema")

@@ -47,10 +47,7 @@ class SurfaceMachine:
     def of(cls, machine: MachineParameters) -> SurfaceMachine:
         """Return the surface machine behind machine parameters.
 
-        Raises
-        ------
-        DesignInfeasible
-            If L_d and L_q differ by more than :data:`SALIENCY_LIMIT`: none of the laws holds then.
+        Raises DesignInfeasible: if L_d and L_q differ by more than :data:`SALIENCY_LIMIT`: none of the laws holds then.
         """
         mean = 0.5 * (machine.L_d_h + machine.L_q_h)
         saliency = abs(machine.L_d_h - machine.L_q_h) / mean
@@ -188,10 +185,8 @@ def circle_poles(machine: SurfaceMachine, omega_e: float, sigma: float) -> tuple
 def place_pid(plant: SecondOrderPlant, poles: Sequence[complex]) -> Pid:
     """Return the PID with derivative filter that gives the closed loop the four poles, (7), (8), (11).
 
-    Raises
-    ------
-    DesignInfeasible
-        If the placement is singular: the plant's static gain is zero at maximum torque (delta = theta).
+    Raises DesignInfeasible: if the placement is singular: the plant's static gain is zero at maximum torque (delta =
+    theta).
     """
     c3, c2, c1, c0 = np.real(np.poly(np.asarray(poles)))[1:]
     matrix = np.array(
@@ -330,10 +325,7 @@ def design_at(
 ) -> PolarDesign:
     """Return the placed loops at an operating point and the stability of both together.
 
-    Raises
-    ------
-    DesignInfeasible
-        If the torque is out of reach at ``V_max`` (A peak, V peak, rad/s electrical).
+    Raises DesignInfeasible: if the torque is out of reach at ``V_max`` (A peak, V peak, rad/s electrical).
     """
     point = equilibrium_without_i_d(machine, omega_e, i_q, V_max)
     if not point.reachable:

@@ -252,10 +252,7 @@ def _model(constants: Sequence[float], omega: Array, loops: CurrentLoops, own: M
 def slope_response(box: MachineBox, loops: CurrentLoops, omega_e_max: float, speeds: int) -> SlopeResponse:
     """Return the responses at ``speeds`` (at least 2) speeds from standstill to ``omega_e_max`` (rad/s).
 
-    Raises
-    ------
-    DesignInfeasible
-        The loops do not settle at one of the speeds.
+    Raises DesignInfeasible: the loops do not settle at one of the speeds.
     """
     omega = np.linspace(0.0, omega_e_max, speeds)
     half = 0.5 * float(omega[1])

@@ -174,10 +174,7 @@ class CanopenDrive:
     def _energise(self, mode: int) -> None:
         """Bring the drive to operation enabled in a mode of operation.
 
-        Raises
-        ------
-        NotAvailable
-            As :meth:`_set_mode`; in another mode than before it was enabled it is off again.
+        Raises NotAvailable: as :meth:`_set_mode`; in another mode than before it was enabled it is off again.
         """
         self._set_mode(mode)
         self.may_be_energised = True
@@ -189,10 +186,7 @@ class CanopenDrive:
     def _set_mode(self, mode: int) -> None:
         """Ask for a mode of operation, and go on when the drive shows it (0x6061), or shows none at all.
 
-        Raises
-        ------
-        NotAvailable
-            The drive refuses the mode, or stays in another one.
+        Raises NotAvailable: the drive refuses the mode, or stays in another one.
         """
         if self._shown_mode() == mode:
             return
@@ -267,12 +261,8 @@ class CanopenDrive:
     ) -> Trace:
         """Record signals every ``decimation`` periods, starting with the excitation if there is one.
 
-        Raises
-        ------
-        NotAvailable
-            More signals or samples than the recorder holds.
-        DriveFault
-            The drive tripped, or the excitation left its abort limits.
+        Raises NotAvailable: more signals or samples than the recorder holds; DriveFault: the drive tripped, or the
+        excitation left its abort limits.
         """
         return self.take(Recording(signals, samples, decimation, excitation, pretrigger), self.wait)
 
@@ -352,10 +342,7 @@ class CanopenDrive:
     def check_operating(self) -> None:
         """Make sure that a machine that was enabled still is: what a stopped one shows is no measurement.
 
-        Raises
-        ------
-        DriveFault
-            The drive tripped, or left operation by itself.
+        Raises DriveFault: the drive tripped, or left operation by itself.
         """
         if not self.may_be_energised:
             return

@@ -65,12 +65,8 @@ class ChangedObjects:
     def restore(self) -> int:
         """Bring back what was changed, read it back, and note nothing more; return how many objects.
 
-        Raises
-        ------
-        VerifyMismatch
-            An object does not hold its old content; each is named.
-        SdoAbort
-            The drive refuses it, for being busy longer than ``BUSY_S``.
+        Raises VerifyMismatch: an object does not hold its old content; each is named; SdoAbort: the drive refuses it,
+        for being busy longer than ``BUSY_S``.
         """
         self._node.before_write = None
         back: set[_Object] = set()

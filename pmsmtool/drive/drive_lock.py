@@ -44,10 +44,7 @@ def claim(connection: Connection, node_id: int) -> None:
 
     Only vendor, product and serial number are read before: another program at work takes these reads for harmless.
 
-    Raises
-    ------
-    SecondMaster
-        Another program of this account works with the drive; it is named.
+    Raises SecondMaster: another program of this account works with the drive; it is named.
     """
     _hold(
         connection, lambda: _key(connection, node_id), "this drive", f"node {node_id}",
@@ -58,10 +55,7 @@ def claim(connection: Connection, node_id: int) -> None:
 def claim_layer_setting(connection: Connection) -> None:
     """Lock the layer setting services of a bus until the connection is closed.
 
-    Raises
-    ------
-    SecondMaster
-        Another program of this account gives node ids on this bus; it is named.
+    Raises SecondMaster: another program of this account gives node ids on this bus; it is named.
     """
     _hold(connection, lambda: f"lss-{_place(connection)}", "the layer setting services of this bus", "LSS")
 
@@ -69,10 +63,7 @@ def claim_layer_setting(connection: Connection) -> None:
 def claim_identity(connection: Connection, vendor: int, product: int, serial: int) -> None:
     """Lock a drive that has no node id yet, by what it says of itself; one without a serial number has no lock.
 
-    Raises
-    ------
-    SecondMaster
-        Another program of this account works with the drive; it is named.
+    Raises SecondMaster: another program of this account works with the drive; it is named.
     """
     if serial and vendor != reference_map().vendor:
         _hold(connection, lambda: _name(vendor, product, serial), "this drive", f"serial {serial}")

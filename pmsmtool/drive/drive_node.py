@@ -134,10 +134,7 @@ class DriveNode:
     def put(self, item: DriveObject, value: float) -> None:
         """Write a number; where the answer is lost it is read back.
 
-        Raises
-        ------
-        NotAvailable
-            The object is too narrow for it.
+        Raises NotAvailable: the object is too narrow for it.
         """
         typed = self.typed(item)
         try:
@@ -176,10 +173,7 @@ class DriveNode:
 
         A number the node does not have is 0: only the vendor is mandatory (CiA 301, object 0x1018).
 
-        Raises
-        ------
-        BusError
-            Two nodes answer.
+        Raises BusError: two nodes answer.
         """
         self.supervision.begin()
         vendor, product, serial = vendor_product_serial(self.sdo, self.map)
@@ -272,10 +266,7 @@ class DriveNode:
     def refuse_late(self) -> None:
         """Refuse a drive whose answers take too long for motion that is looked at.
 
-        Raises
-        ------
-        DriveTimeout
-            With how long they take.
+        Raises DriveTimeout: with how long they take.
         """
         took_s = self._answers_s(LOOKS)
         mean_s = sum(took_s) / LOOKS
@@ -288,13 +279,7 @@ class DriveNode:
             )  # fmt: skip
 
     def enable(self) -> None:
-        """Walk to OPERATION ENABLED.
-
-        Raises
-        ------
-        DriveFault
-            The drive is in fault, or stays in a state on the way.
-        """
+        """Walk to OPERATION ENABLED. Raises DriveFault: the drive is in fault, or stays in a state on the way."""
         for _ in range(len(State)):
             state = self.state()
             if state is State.OPERATION_ENABLED:
@@ -339,13 +324,7 @@ class DriveNode:
         return self.wait_for_state(is_safe, timeout_s)
 
     def reset_fault(self) -> None:
-        """Reset a fault by the rising edge of its bit.
-
-        Raises
-        ------
-        DriveFault
-            It came back.
-        """
+        """Reset a fault by the rising edge of its bit. Raises DriveFault: it came back."""
         self.go(Command.DISABLE_VOLTAGE)
         self.go(Command.FAULT_RESET)
         state = self.wait_for_state(lambda now: now not in (State.FAULT, State.FAULT_REACTION_ACTIVE))
@@ -380,10 +359,7 @@ class DriveNode:
     def reset(self) -> None:
         """Reset the node, wait until it answers again, and start it if it was operational.
 
-        Raises
-        ------
-        DriveTimeout
-            It does not come back.
+        Raises DriveTimeout: it does not come back.
         """
         operational = self.supervision.nmt_state is NmtState.OPERATIONAL
         with self.supervision.expected_reset():
@@ -414,12 +390,8 @@ class DriveNode:
     def store(self) -> None:
         """Store all parameters; the command is sent once, flash memory wears out.
 
-        Raises
-        ------
-        SdoAbort
-            The drive refuses to store.
-        DriveTimeout
-            No answer within ``STORE_TIMEOUT_S``, and the store cannot be seen to have ended.
+        Raises SdoAbort: the drive refuses to store; DriveTimeout: no answer within ``STORE_TIMEOUT_S``, and the store
+        cannot be seen to have ended.
         """
         index, sub = objects.STORE_ALL
         try:
@@ -430,10 +402,7 @@ class DriveNode:
     def wait_for_store(self) -> None:
         """Wait where the confirmation is missing: the drive has finished when it answers for 0x1010 again.
 
-        Raises
-        ------
-        DriveTimeout
-            It does not within twice ``STORE_TIMEOUT_S``.
+        Raises DriveTimeout: it does not within twice ``STORE_TIMEOUT_S``.
         """
         deadline = self.connection.clock.now() + STORE_TIMEOUT_S
         slow = self.sdo.slow_objects.pop(objects.STORE_ALL)  # of the command: a question is answered at once, or not

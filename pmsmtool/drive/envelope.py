@@ -100,10 +100,8 @@ class Envelope:
     def refuse_gravity(self) -> None:
         """Refuse a load that falls when the torque is zero.
 
-        Raises
-        ------
-        SafetyRefusal
-            Gravity load on a shaft that is not locked: the dead-man proof and every stop hold zero torque.
+        Raises SafetyRefusal: gravity load on a shaft that is not locked: the dead-man proof and every stop hold zero
+        torque.
         """
         if self.load == "gravity" and self.shaft != "locked":
             raise SafetyRefusal(

@@ -246,10 +246,7 @@ class GuardedDrive:
 
         From then on a stop removes the voltage: the speed loop is proven no more.
 
-        Raises
-        ------
-        SafetyRefusal
-            The drive is not off, or does not hold what was written.
+        Raises SafetyRefusal: the drive is not off, or does not hold what was written.
         """
         where = f"node {self._node.node}, 0x{item.index:04X}:{item.sub:02X}"
         if self._drive.may_be_energised or not is_safe(self._node.state()):
@@ -267,12 +264,8 @@ class GuardedDrive:
     def enable(self) -> None:
         """Bring the drive to operation enabled at zero reference, supervised by the tool's heartbeat.
 
-        Raises
-        ------
-        SafetyRefusal
-            The dead-man was not proven, or the guard has ended.
-        BusError
-            The heartbeat cannot be sent; nothing is enabled.
+        Raises SafetyRefusal: the dead-man was not proven, or the guard has ended; BusError: the heartbeat cannot be
+        sent; nothing is enabled.
         """
         if self._ended:
             raise SafetyRefusal(
@@ -417,10 +410,8 @@ class GuardedDrive:
     def _watch(self) -> None:
         """Look at the machine once: still in operation, and every limit kept.
 
-        Raises
-        ------
-        LimitExceeded, DriveFault
-            A limit is exceeded, after a confirmed stop; or the drive has left operation by itself.
+        Raises LimitExceeded, DriveFault: a limit is exceeded, after a confirmed stop; or the drive has left operation
+        by itself.
         """
         self._drive.check_operating()
         current = self._current()

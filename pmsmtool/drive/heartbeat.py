@@ -92,10 +92,7 @@ class Heartbeat:
         A drive whose supervision has ended operation watches again from the next heartbeat on, not before (CiA 301,
         section 7.2.8.2.2).
 
-        Raises
-        ------
-        BusError
-            It cannot be sent.
+        Raises BusError: it cannot be sent.
         """
         if self._ticker is None:
             self.start()

@@ -78,13 +78,7 @@ def readings(node: DriveNode, names: list[str], period_s: float, seconds: float 
 
 
 def sent(node: DriveNode, names: list[str], period_s: float, seconds: float | None) -> Readings:
-    """As :func:`readings`, of what the drive sends by itself.
-
-    Raises
-    ------
-    DriveTimeout
-        It sends nothing any more.
-    """
+    """As :func:`readings`, of what the drive sends by itself. Raises DriveTimeout: it sends nothing any more."""
     clock = node.connection.clock
     with live_values(node, names, period_s) as live:
         start = clock.now()

@@ -197,10 +197,7 @@ def logged_values(
 ) -> tuple[LoggedDrive, Iterator[tuple[float, dict[str, float]]]]:
     """Return the drive of a log, and what it says over time (s).
 
-    Raises
-    ------
-    ConfigError
-        The log holds no frame, no node, or several and none was named.
+    Raises ConfigError: the log holds no frame, no node, or several and none was named.
     """
     present = nodes_in(frames)
     if node is None and len(present) != 1:

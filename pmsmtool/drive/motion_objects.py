@@ -154,10 +154,7 @@ def _stated_rated(node: DriveNode) -> Quantity:
 def rated_apk(node: DriveNode) -> float:
     """Return the rated current (A peak; the larger reading where it is not known to be peak or rms).
 
-    Raises
-    ------
-    NotAvailable
-        The drive does not say.
+    Raises NotAvailable: the drive does not say.
     """
     found = rated_ma(node)
     if found is not None:
@@ -178,10 +175,7 @@ def rated_apk(node: DriveNode) -> float:
 def shown_current(node: DriveNode, rated: float) -> Quantity:
     """Return where the torque current is shown, in A peak per count; torque counts as current where nothing else does.
 
-    Raises
-    ------
-    NotAvailable
-        The drive shows neither.
+    Raises NotAvailable: the drive shows neither.
     """
     own = _own(node, "current")
     if own is not None and node.held(own.item) is not None:
@@ -210,10 +204,7 @@ def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
 
     A drive whose own slope (0x6087) is too slow for a push takes it in mode 10, if it has that: this program ramps it.
 
-    Raises
-    ------
-    NotAvailable
-        The drive has no such mode, or no target in it.
+    Raises NotAvailable: the drive has no such mode, or no target in it.
     """
     modes = int(node.held(objects.SUPPORTED_MODES) or 0)
     if node.map.capabilities.torque_mode is not False and node.held(objects.TARGET_TORQUE_PERMILLE) is not None:
@@ -247,10 +238,7 @@ def cyclic_period_s(node: DriveNode, wanted_s: float) -> float:
 def quicken_slope(node: DriveNode) -> None:
     """Lend the drive a slope for its torque that leaves something of a push, where its own does not.
 
-    Raises
-    ------
-    NotAvailable
-        The drive keeps its slow one: a push would take seconds, and turn the shaft on and on.
+    Raises NotAvailable: the drive keeps its slow one: a push would take seconds, and turn the shaft on and on.
     """
     if not slow_slope_s(node):
         return
@@ -291,10 +279,8 @@ def _decimal(unit: int) -> float:
 def limited_speed(node: DriveNode) -> LimitedSpeed:
     """Return a velocity mode of known unit whose current limit this program may set.
 
-    Raises
-    ------
-    NotAvailable
-        The drive has no such mode, its map does not state its unit of speed, or it has no current limit.
+    Raises NotAvailable: the drive has no such mode, its map does not state its unit of speed, or it has no current
+    limit.
     """
     own, row = _own(node, "target_speed"), node.map.motion.get("target_speed")
     limit = _own(node, "current_limit")  # the one that its map names: what it does in this mode is the maker's matter
@@ -313,11 +299,8 @@ def position_units(node: DriveNode) -> float:
 
     Where the drive's objects do not tell, the number that its owner states in a map does.
 
-    Raises
-    ------
-    NotAvailable
-        Nothing tells, a gear (0x6091) or a factor (0x6093) stands between and nothing says in which units, or a turn
-        has too few of them.
+    Raises NotAvailable: nothing tells, a gear (0x6091) or a factor (0x6093) stands between and nothing says in which
+    units, or a turn has too few of them.
     """
     if node.held(POSITION) is None:
         raise NotAvailable("the drive shows no position", where=f"node {node.node}, 0x6064")
@@ -334,10 +317,7 @@ def position_units(node: DriveNode) -> float:
 def position_turns(node: DriveNode, units: float) -> float:
     """Return after how many turns of so many units the position begins again.
 
-    Raises
-    ------
-    NotAvailable
-        After so few that the speed seen between two looks could be a wrong one.
+    Raises NotAvailable: after so few that the speed seen between two looks could be a wrong one.
     """
     size = 8 * node.typed(POSITION).size
     least, most = (node.held(item) or 0.0 for item in RANGE_LIMIT)

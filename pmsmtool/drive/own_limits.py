@@ -55,13 +55,8 @@ def lower_limits(drive: CanopenDrive, envelope: Envelope) -> OwnLimits:
     Where it has none, a drive whose every command is a bounded current goes on: its current is commanded and looked
     at by the guard, and its speed may not even overshoot.
 
-    Raises
-    ------
-    SafetyRefusal
-        The current limit is none beside the rated current, or beyond what the drive shows of its current; or the drive
-        does not hold what was written.
-    NotAvailable
-        The drive lacks a limit that nothing replaces.
+    Raises SafetyRefusal: the current limit is none beside the rated current, or beyond what the drive shows of its
+    current; or the drive does not hold what was written; NotAvailable: the drive lacks a limit that nothing replaces.
     """
     node = drive.node
     rated = rated_apk(node)
@@ -93,13 +88,7 @@ def lower_limits(drive: CanopenDrive, envelope: Envelope) -> OwnLimits:
 
 
 def clear_offsets(node: DriveNode) -> None:
-    """Make the drive add nothing to a command while it is lent.
-
-    Raises
-    ------
-    SafetyRefusal
-        It goes on adding something.
-    """
+    """Make the drive add nothing to a command while it is lent. Raises SafetyRefusal: it goes on adding something."""
     for item in OFFSETS:
         held = node.held(item)
         if not held:

@@ -80,13 +80,7 @@ class DriveParameters:
         return found
 
     def read_value(self, name: str) -> float:
-        """Return one parameter in SI.
-
-        Raises
-        ------
-        NotAvailable
-            The drive has no object for it.
-        """
+        """Return one parameter in SI. Raises NotAvailable: the drive has no object for it."""
         if name not in self.map.cells:
             raise NotAvailable(f"drive family {self.map.name} has no object for {name}", where=f"node {self.node.node}")
         cell = self.map.cells[name]
@@ -113,10 +107,7 @@ class DriveParameters:
     def check_layout(self) -> None:
         """Refuse a drive whose parameter set this program does not know.
 
-        Raises
-        ------
-        NotAvailable
-            Schema version or layout signature differ.
+        Raises NotAvailable: schema version or layout signature differ.
         """
         if not self.map.staging:
             return
@@ -164,10 +155,7 @@ class DriveParameters:
     def expected_crc(self, new: Mapping[str, bytes]) -> int:
         """Return the CRC-32 of the drive's whole set after a change.
 
-        Raises
-        ------
-        ConfigError
-            The set that results cannot be used: ranges, or tables that do not fit their descriptor.
+        Raises ConfigError: the set that results cannot be used: ranges, or tables that do not fit their descriptor.
         """
         values, words = unpack_image(self.node.sdo.upload(*objects.SET_IMAGE, mode=Mode.BLOCK).data)
         values = dict(values)

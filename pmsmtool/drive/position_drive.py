@@ -114,10 +114,7 @@ class PositionDrive(TorqueDrive):
     def move_to(self, angle_rad: float, *, at_once: bool = False) -> None:
         """Start a move to an angle from where the shaft stood when it was enabled; ``at_once`` ends another move.
 
-        Raises
-        ------
-        DriveTimeout
-            The drive does not take the set-point.
+        Raises DriveTimeout: the drive does not take the set-point.
         """
         counts = self._start_counts + angle_rad / (2.0 * math.pi) * self.counts_per_turn
         start_move(self.node, counts, at_once=at_once)
@@ -134,10 +131,7 @@ class PositionDrive(TorqueDrive):
     def lend_profile(self, speed: int, ramp: int) -> None:
         """Write counts of speed and of both ramps, whatever their unit; the guard brings the old ones back.
 
-        Raises
-        ------
-        NotAvailable
-            The drive refuses them.
+        Raises NotAvailable: the drive refuses them.
         """
         for item, counts in zip((objects.PROFILE_VELOCITY, *RAMPS), (speed, ramp, ramp), strict=True):
             try:

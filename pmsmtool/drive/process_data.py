@@ -152,10 +152,7 @@ def live_values(
 def _usable(node: DriveNode, entries: int, wanted: int) -> list[tuple[int, BorrowedPdo]]:
     """Return the PDOs that can be borrowed by what they hold, with their numbers; writes nothing.
 
-    Raises
-    ------
-    NotAvailable
-        Fewer than wanted; each other one is named with its reason.
+    Raises NotAvailable: fewer than wanted; each other one is named with its reason.
     """
     found: list[tuple[int, BorrowedPdo]] = []
     reasons: list[str] = []
@@ -257,12 +254,8 @@ class BorrowedPdo:
     def read(cls, node: DriveNode, communication: int, mapping: int, entries: int) -> BorrowedPdo:
         """Read a PDO of which so many entries will be overwritten; writes nothing.
 
-        Raises
-        ------
-        SdoAbort
-            The drive has no such PDO, or fewer entries.
-        NotAvailable
-            It could not be brought back: it is multiplexed, or one of its entries names nothing that the drive has.
+        Raises SdoAbort: the drive has no such PDO, or fewer entries; NotAvailable: it could not be brought back: it is
+        multiplexed, or one of its entries names nothing that the drive has.
         """
         read = node.sdo.read
         count = read(mapping, 0, size=1)[0]
@@ -312,10 +305,7 @@ class BorrowedPdo:
     def bring_back(self, node: DriveNode) -> None:
         """Write what it was, and read it back; a refusal of what the drive still holds is none.
 
-        Raises
-        ------
-        VerifyMismatch
-            An object does not hold its old content; each is named.
+        Raises VerifyMismatch: an object does not hold its old content; each is named.
         """
         off, on = ((self.communication, 1, _word(word)) for word in (self.cob_id | _OFF, self.cob_id))
         refused: dict[tuple[int, int], str] = {}

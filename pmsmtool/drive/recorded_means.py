@@ -88,10 +88,7 @@ class RecordedMeans(Recorder):
     def start_average(self, signals: Sequence[str], periods: int) -> None:
         """Start recording the next ``periods`` control periods.
 
-        Raises
-        ------
-        NotAvailable
-            The drive has no recorder, or not these signals.
+        Raises NotAvailable: the drive has no recorder, or not these signals.
         """
         omega_e = self._omega_e_rad_s()
         if omega_e > REST_RAD_S:

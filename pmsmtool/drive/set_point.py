@@ -24,10 +24,7 @@ def start_move(node: DriveNode, counts: float, *, at_once: bool = False) -> None
 
     Without ``at_once`` a drive that moves already goes there after its move.
 
-    Raises
-    ------
-    DriveTimeout
-        The drive does not take the set-point.
+    Raises DriveTimeout: the drive does not take the set-point.
     """
     node.put(TARGET_POSITION, (round(counts) + WHOLE / 2) % WHOLE - WHOLE / 2)
     word = Command.ENABLE_OPERATION | (Control.AT_ONCE if at_once else 0)

@@ -89,13 +89,7 @@ def quick_stop(node: DriveNode, *, ramp: bool = True, say: Callable[[str], None]
 
 
 def disable(node: DriveNode) -> State:
-    """Remove the voltage; return the state that confirms it.
-
-    Raises
-    ------
-    StopNotConfirmed
-        The statusword does not.
-    """
+    """Remove the voltage; return the state that confirms it. Raises StopNotConfirmed: the statusword does not."""
     try:
         state = node.disable_voltage(STATE_TIMEOUT_S)
     except SdoAbort:  # it takes no controlword: what its statusword shows counts

@@ -49,10 +49,7 @@ class Entry:
 def encode(data_type: int, value: float | str | bytes) -> bytes:
     """Return the bytes of a value on the wire (CiA 301, section 7.1.4, little endian).
 
-    Raises
-    ------
-    ConfigError
-        If the value does not fit its type.
+    Raises ConfigError: if the value does not fit its type.
     """
     if isinstance(value, bytes):
         return value
@@ -78,10 +75,7 @@ def encode(data_type: int, value: float | str | bytes) -> bytes:
 def decode_value(data_type: int, text: str, node_id: int | None = None) -> bytes:
     """Return the bytes of a ``ParameterValue`` or ``DefaultValue`` text.
 
-    Raises
-    ------
-    ConfigError
-        If the text is no value of the type.
+    Raises ConfigError: if the text is no value of the type.
     """
     try:
         if data_type in (REAL32, REAL64):
@@ -233,10 +227,7 @@ def new_dcf(
 def values_of(sheet: Eds, wanted: Container[Address] | None = None) -> dict[Address, bytes]:
     """Return the ``ParameterValue`` of every object that is wanted (all: None) and has one, encoded.
 
-    Raises
-    ------
-    ConfigError
-        Listing every value that is none of its type.
+    Raises ConfigError: listing every value that is none of its type.
     """
     found: dict[Address, bytes] = {}
     wrong = []

@@ -307,10 +307,7 @@ class DriveMap:
     def encode(self, wanted: ParameterSet) -> dict[str, bytes]:
         """Return the bytes of every entry the drive has an object for, in the order they are written.
 
-        Raises
-        ------
-        ConfigError
-            Entries that do not fit; all of them.
+        Raises ConfigError: entries that do not fit; all of them.
         """
         encoded: dict[str, bytes] = {}
         wrong: list[str] = []

@@ -136,13 +136,7 @@ def _expected_unit(parameter: Parameter, form: str) -> str:
 
 @next_step(NEXT_STEP)
 def parse_drive_map(text: str, where: str = "map.toml") -> DriveMap:
-    """Read a map file.
-
-    Raises
-    ------
-    ConfigError
-        Everything that is wrong with it, at once, each with its line.
-    """
+    """Read a map file. Raises ConfigError: everything that is wrong with it, at once, each with its line."""
     document = parse_toml(text, where=where)
     if document.get("schema") != SCHEMA:
         raise ConfigError(f"schema is {document.get('schema')!r}, expected {SCHEMA!r}", where=where)

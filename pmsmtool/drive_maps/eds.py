@@ -108,10 +108,7 @@ def without_remark(text: str) -> str:
 def parse_integer(text: str, node_id: int | None = None) -> int:
     """Return an integer as data sheets write it: decimal, hex, with leading zeros, ``$NODEID+0x600``, with a remark.
 
-    Raises
-    ------
-    ValueError
-        If it is none of these.
+    Raises ValueError: if it is none of these.
     """
     total = 0
     for part in without_remark(text).replace(" ", "").replace("\t", "").split("+"):

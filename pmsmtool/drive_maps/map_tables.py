@@ -15,10 +15,7 @@ from pmsmtool.params.parameter_set import SATURATION, TABLE_NAMES
 def encode_table(name: str, numbers: Sequence[float], values: Mapping[str, float]) -> bytes:
     """Return the DOMAIN of an axis or a table; tables in the format ``lut.format`` of the same set says.
 
-    Raises
-    ------
-    ConfigError
-        A number does not fit the format.
+    Raises ConfigError: a number does not fit the format.
     """
     try:
         if _is_binary32(name) or values.get("lut.format") != LUT_FORMAT_INT16:

@@ -23,13 +23,7 @@ def family_names() -> tuple[str, ...]:
 
 
 def load_family(name: str) -> DriveMap:
-    """Return the shipped map of a family.
-
-    Raises
-    ------
-    ConfigError
-        There is no such family.
-    """
+    """Return the shipped map of a family. Raises ConfigError: there is no such family."""
     if name not in family_names():
         near = get_close_matches(name.lower(), family_names(), 1)
         raise ConfigError(

@@ -84,10 +84,7 @@ _PER_PHASE = frozenset({"resistance", "inductance"})
 def wire_unit(text: str) -> WireUnit:
     """Return what a unit says.
 
-    Raises
-    ------
-    ValueError
-        It is none, or a current that says neither ``peak`` nor ``rms``; the message says why.
+    Raises ValueError: it is none, or a current that says neither ``peak`` nor ``rms``; the message says why.
     """
     if text in _RELATIVE:
         dimension, base = _RELATIVE[text]
@@ -131,10 +128,7 @@ def as_peak(symbol: str) -> str:
 def counted_in(text: str, symbol: str) -> float:
     """Return one count of unit ``text`` in the unit ``symbol``: of ``units.UNITS``, or composed (``N m/A``).
 
-    Raises
-    ------
-    ValueError
-        Not a unit, a relative one, or of another dimension.
+    Raises ValueError: not a unit, a relative one, or of another dimension.
     """
     given = wire_unit(text)
     dimension, scale = _symbol(symbol)

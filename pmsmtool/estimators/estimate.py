@@ -114,10 +114,7 @@ class SensorTolerance:
 def chi2_gate(chi2: float, stage: str) -> tuple[Verdict, float]:
     """Return the verdict of a reduced chi-square and the factor on the standard deviation.
 
-    Raises
-    ------
-    IdentificationError
-        ``E_MODEL_MISMATCH`` above :data:`CHI2_REFUSE`.
+    Raises IdentificationError: ``E_MODEL_MISMATCH`` above :data:`CHI2_REFUSE`.
     """
     if not math.isfinite(chi2):
         raise refuse("E_NOT_CONVERGED", f"reduced chi-square is {chi2}", stage=stage)

@@ -214,10 +214,7 @@ def _beats(w: Array, spacing_s: float) -> Array:
 def resolve(pushes: Sequence[Blocks]) -> Resolved:
     """Fit all shapes to the rows of all pushes.
 
-    Raises
-    ------
-    IdentificationError
-        ``E_NOT_IDENTIFIABLE``: the pushes do not tell the terms apart.
+    Raises IdentificationError: ``E_NOT_IDENTIFIABLE``: the pushes do not tell the terms apart.
     """
     smallest = SMALLEST_SHARE * max(abs(push.i_q) for push in pushes)
     kept = [np.abs(push.i) >= smallest for push in pushes]

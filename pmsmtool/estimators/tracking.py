@@ -177,10 +177,7 @@ class Tracker:
 def observation_noise(observations: Trace, known: Known) -> tuple[float, float]:
     """Standard deviation of one observation of u_d and u_q (V), from second differences against the start's model.
 
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: too few observations.
+    Raises IdentificationError: ``E_EXCITATION``: too few observations.
     """
     if len(observations) < MINIMUM:
         raise refuse(

@@ -125,10 +125,7 @@ def show_torque_limit(
 def require_limit(shown: LimitShown | None) -> None:
     """Refuse a drive whose commands are not all bounded here and that does not keep its limit.
 
-    Raises
-    ------
-    SafetyRefusal
-        The limit does not act.
+    Raises SafetyRefusal: the limit does not act.
     """
     if shown is not None and not shown.acts:
         raise SafetyRefusal(

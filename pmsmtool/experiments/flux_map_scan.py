@@ -148,10 +148,7 @@ def pulse(
 
     ``brake`` stops the shaft by the drive's own speed controller first.
 
-    Raises
-    ------
-    DriveFault
-        The drive aborted the pulses at its current or speed limit.
+    Raises DriveFault: the drive aborted the pulses at its current or speed limit.
     """
     excitation = Excitation(
         shape=Shape.HYSTERESIS,
@@ -184,10 +181,8 @@ def _brake(drive: Drive, omega_e_rad_s: float) -> None:
 def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float) -> AxisPulse:
     """Find voltage and band of one axis by growing shots.
 
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: the largest voltage does not bring the current to its band within a shot.
+    Raises IdentificationError: ``E_EXCITATION``: the largest voltage does not bring the current to its band within a
+    shot.
     """
     u = max(FIRST_SHARE * plan.u_max_v, SHARES[0] * plan.u_least_v)
     samples = round((2 * TURNS_LEAST + 1) * plan.half_periods)
@@ -252,10 +247,7 @@ def scan(
 
     The drive is enabled on entry with its frame on the rotor, and holds zero current on return.
 
-    Raises
-    ------
-    LimitExceeded
-        A trace went over the largest current by more than the allowance.
+    Raises LimitExceeded: a trace went over the largest current by more than the allowance.
     """
     for rectangle, ratio in zip(plan.rectangles, VOLTAGE_RATIOS, strict=False):
         u = (ratio[0] * d.u_v, ratio[1] * q.u_v)

@@ -78,10 +78,7 @@ def _try_direction(guard: GuardedDrive, drive: PositionDrive, way: float) -> boo
 
     Returns whether it was seen to turn: not where friction holds it, or where the drive's current limit stays.
 
-    Raises
-    ------
-    SafetyRefusal
-        It turns against the demand; the voltage is off.
+    Raises SafetyRefusal: it turns against the demand; the voltage is off.
     """
     clock = drive.node.connection.clock
     least = max(min(TRY_RAD, TRY_SHARE * abs(way)), TRY_COUNTS * drive.rad_per_count)

@@ -67,12 +67,8 @@ def find_profile(
     the speed, or faster where its ramp would not be seen, and rests where it began. The guard brings the old counts
     back.
 
-    Raises
-    ------
-    NotAvailable
-        The demand does not follow the counts, or the drive refuses them.
-    DriveTimeout
-        A move does not end.
+    Raises NotAvailable: the demand does not follow the counts, or the drive refuses them; DriveTimeout: a move does not
+    end.
     """
     slow = min(speed_rad_s, max(TRIAL_SHARE * speed_rad_s, SEEN_RAMP_S * acceleration_rad_s2))
     slow = min(slow, 0.5 * math.sqrt(abs(way_rad) * acceleration_rad_s2))

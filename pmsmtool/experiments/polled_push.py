@@ -112,10 +112,7 @@ def push_both_ways(
 
     ``answered`` is called as soon as that is known.
 
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: the shaft does not answer.
+    Raises IdentificationError: ``E_EXCITATION``: the shaft does not answer.
     """
     answer = acceleration_per_ampere(drive, plan.i_test_a, lambda way, _: way > ANSWER_RAD)
     answered(answer)
@@ -291,10 +288,7 @@ def swing(
     ``answered`` is called as soon as it is known how the shaft answers.
     Larger currents go to a smaller speed where the pushes before say that voltage or current would leave their limits.
 
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: the shaft does not answer.
+    Raises IdentificationError: ``E_EXCITATION``: the shaft does not answer.
     """
     answer = acceleration_per_ampere(
         drive, plan.i_test_a, lambda way, seconds: 2.0 * way / seconds > ANSWER_SHARE * plan.omega_m_rad_s

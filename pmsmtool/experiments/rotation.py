@@ -107,10 +107,7 @@ def step_within(step_rad: float, dwell_s: float, omega_max_rad_s: float) -> tupl
     A limit shortens the step, to half of ``STEP_RAD`` at the least, and then makes it longer in time
     (:func:`dwell_within`).
 
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``, as there.
+    Raises IdentificationError: ``E_EXCITATION``, as there.
     """
     shorter = min(step_rad, omega_max_rad_s * (dwell_s + ROW_S) / SWING)
     if shorter >= min(step_rad, 0.5 * STEP_RAD):

@@ -128,10 +128,7 @@ def inject_square(
 ) -> Trace:
     """Record one shot, by default of all that an estimate needs; the bias stays on before and after it.
 
-    Raises
-    ------
-    DriveFault
-        The drive aborted the excitation at one of its limits.
+    Raises DriveFault: the drive aborted the excitation at one of its limits.
     """
     count = plan.samples if samples is None else samples
     # the lead and the bus time between starting the injection and arming the recorder

@@ -102,10 +102,7 @@ def bind(library: ctypes.CDLL, *, double: bool = False) -> CoreBinding:
 def core(*, double: bool = False) -> CoreBinding:
     """Load the core, as flashed (float) or in double.
 
-    Raises
-    ------
-    PmsmtoolError
-        The compiled library is missing or does not load.
+    Raises PmsmtoolError: the compiled library is missing or does not load.
     """
     return _bind(double)
 

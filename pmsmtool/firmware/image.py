@@ -189,10 +189,7 @@ def pack_image(values: Mapping[str, float], lut: bytes = b"") -> bytes:
 def unpack_image(image: bytes) -> tuple[dict[str, float], bytes]:
     """Return the values and the look-up words of an image; the inverse of :func:`pack_image`.
 
-    Raises
-    ------
-    ImageRefused
-        Wrong size, a value out of range, or look-up data that do not fit.
+    Raises ImageRefused: wrong size, a value out of range, or look-up data that do not fit.
     """
     if len(image) < SCALAR_BYTES:
         raise ImageRefused(ImageStatus.SIZE, f"{len(image)} bytes, the scalars alone take {SCALAR_BYTES}")

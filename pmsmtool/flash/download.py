@@ -467,10 +467,7 @@ class Download:
 def set_named() -> Iterator[list[Download]]:
     """Say at a Ctrl-C which set the drives hold; yields the list into which downloads are put that are begun.
 
-    Raises
-    ------
-    Interrupted
-        In place of a ``KeyboardInterrupt``, and for all drives where there are several.
+    Raises Interrupted: in place of a ``KeyboardInterrupt``, and for all drives where there are several.
     """
     jobs: list[Download] = []
     try:
@@ -486,10 +483,7 @@ def set_named() -> Iterator[list[Download]]:
 def check_identity(node: DriveNode, expected: Identity) -> None:
     """Refuse to go on when another drive answers than the one a plan was made for.
 
-    Raises
-    ------
-    SafetyRefusal
-        Vendor, product or serial number differ.
+    Raises SafetyRefusal: vendor, product or serial number differ.
     """
     found = node.identity()
     if (found.vendor, found.product, found.serial) != (expected.vendor, expected.product, expected.serial):
@@ -504,10 +498,7 @@ def check_identity(node: DriveNode, expected: Identity) -> None:
 def refuse_while_enabled(node: DriveNode) -> None:
     """Refuse to write to a drive that may drive current; it is never disabled unasked.
 
-    Raises
-    ------
-    SafetyRefusal
-        The statusword shows an energised state.
+    Raises SafetyRefusal: the statusword shows an energised state.
     """
     state = node.state()
     if state is None or state.energised:

@@ -37,13 +37,7 @@ class GainJournal:
         self._snapshot = Snapshot("journal", "open", identity, 0, CONTENT, tuple(entries))
 
     def begin(self) -> None:
-        """Put the journal on disk.
-
-        Raises
-        ------
-        ConfigError
-            The folder cannot be written: nothing may be changed then.
-        """
+        """Put the journal on disk. Raises ConfigError: the folder cannot be written: nothing may be changed then."""
         write_snapshot(self.path, self._snapshot)
 
     def note(self, index: int, sub: int, data: bytes) -> None:
@@ -58,10 +52,7 @@ class GainJournal:
     def end(self, node: DriveNode) -> None:
         """Read every object, and remove the journal when all hold again what they held.
 
-        Raises
-        ------
-        VerifyMismatch
-            An object does not; the journal stays.
+        Raises VerifyMismatch: an object does not; the journal stays.
         """
         _confirm(node, self._snapshot)
         self.path.unlink(missing_ok=True)

@@ -120,13 +120,7 @@ class Snapshot:
 
 @next_step(NEXT_STEP)
 def parse_snapshot(text: str, where: str) -> Snapshot:
-    """Read a snapshot's text.
-
-    Raises
-    ------
-    ConfigError
-        Not a snapshot, or damaged.
-    """
+    """Read a snapshot's text. Raises ConfigError: not a snapshot, or damaged."""
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -178,10 +172,7 @@ def read_snapshot(path: Path) -> Snapshot:
 def write_snapshot(path: Path, snapshot: Snapshot) -> None:
     """Write a snapshot so that the file is the old or the new one at every instant, and on disk on return.
 
-    Raises
-    ------
-    ConfigError
-        The folder cannot be written.
+    Raises ConfigError: the folder cannot be written.
     """
     make_folder(path.parent, hint=ELSEWHERE)
     write_file(path, snapshot.dumps(), synced=True, hint=ELSEWHERE)

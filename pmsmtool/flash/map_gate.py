@@ -36,12 +36,8 @@ def memory_of(folder: JournalFolder) -> Path:
 def check_map(drive_map: DriveMap, identity: Identity, folder: JournalFolder) -> None:
     """Refuse a map that is not this drive's, or not the one it was last written through; nothing is written.
 
-    Raises
-    ------
-    ConfigError
-        The map is for another identity, or says none.
-    SafetyRefusal
-        The drive was last written through another map.
+    Raises ConfigError: the map is for another identity, or says none; SafetyRefusal: the drive was last written through
+    another map.
     """
     if drive_map.vendor == UNKNOWN_VENDOR and drive_map.scales:
         raise _other_drive(drive_map, identity)
@@ -86,10 +82,7 @@ def check_motion(drive_map: DriveMap, identity: Identity) -> None:
 
     What CiA 402 alone says (the shipped map of :data:`GENERIC`) holds on every drive.
 
-    Raises
-    ------
-    ConfigError
-        The map is for another identity, or is no shipped one and says none.
+    Raises ConfigError: the map is for another identity, or is no shipped one and says none.
     """
     named = drive_map.vendor != UNKNOWN_VENDOR and drive_map.is_for(*identity.vendor_product)
     if not named and drive_map != load_family(GENERIC):

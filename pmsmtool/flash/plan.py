@@ -185,10 +185,7 @@ def _with_own_torque(
 ) -> tuple[ParameterSet, dict[str, float]]:
     """Return the set with the torque per ampere that the drive itself holds, where gains are counted by it.
 
-    Raises
-    ------
-    ConfigError
-        It is neither that of an ampere peak nor rms of the machine that was designed for.
+    Raises ConfigError: it is neither that of an ampere peak nor rms of the machine that was designed for.
     """
     expected = wanted.values.get(TORQUE_PER_AMPERE)
     if expected is None:
@@ -214,10 +211,7 @@ def _with_own_increments(
 ) -> tuple[ParameterSet, dict[str, float]]:
     """Return the set with the increments of a turn that the drive itself holds, where gains are counted by them.
 
-    Raises
-    ------
-    ConfigError
-        It holds none.
+    Raises ConfigError: it holds none.
     """
     cell = drive_map.cells.get(INCREMENTS)
     if cell is None or INCREMENTS not in wanted.values:

@@ -52,12 +52,8 @@ def marks_of(content: str, when: datetime.datetime) -> dict[str, bytes]:
 def plan_download(node: DriveNode, wanted: ParameterSet) -> Plan:
     """Read what a drive holds and return the plan that brings it to a set; nothing is written.
 
-    Raises
-    ------
-    NotAvailable
-        The drive's parameter set has another layout than this program's.
-    ConfigError
-        Values out of bounds, or that do not fit the drive's types; rows of the map that the drive contradicts.
+    Raises NotAvailable: the drive's parameter set has another layout than this program's; ConfigError: values out of
+    bounds, or that do not fit the drive's types; rows of the map that the drive contradicts.
     """
     parameters, names = _settled(node), names_to_read(node.map, wanted)
     if not node.map.staging:  # the reference drive shows the layout of its set
@@ -204,10 +200,8 @@ def restore_plan(drive_map: DriveMap, snapshot: Snapshot, found: Mapping[str, by
 def due_of_journal(snapshot: Snapshot, plan: Plan, folder: JournalFolder) -> Plan:
     """Return what of the last journal's plan is due: nothing where a later download was killed before it wrote.
 
-    Raises
-    ------
-    SafetyRefusal
-        The journal is finished, and the drive was written otherwise since: its old set is more than one download back.
+    Raises SafetyRefusal: the journal is finished, and the drive was written otherwise since: its old set is more than
+    one download back.
     """
     if snapshot.state == "open" or not plan.changes:
         return plan

@@ -33,10 +33,7 @@ FORM = "one line per drive: NODE SERIAL, as `pmsmtool scan` lists them; # begins
 def read_serials(path: Path) -> dict[int, int]:
     """Return node id -> serial number, from a file of lines ``NODE SERIAL`` (decimal or 0x...).
 
-    Raises
-    ------
-    ConfigError
-        It cannot be read, a line is not of that form, a node stands twice, or a serial number is 0.
+    Raises ConfigError: it cannot be read, a line is not of that form, a node stands twice, or a serial number is 0.
     """
     found: dict[int, int] = {}
     wrong = []
@@ -63,10 +60,7 @@ def read_serials(path: Path) -> dict[int, int]:
 def check_canary(record: RunRecord, *, same_set: bool, where: str) -> None:
     """Refuse a run that does not prove the set on a drive.
 
-    Raises
-    ------
-    SafetyRefusal
-        A stage of :data:`PROVEN` did not pass, or another set was proven.
+    Raises SafetyRefusal: a stage of :data:`PROVEN` did not pass, or another set was proven.
     """
     missing = [name for name in PROVEN if not record.passed(name)]
     if missing:
@@ -126,10 +120,7 @@ def _shown(value: object) -> str:
 def wait_still(nodes: Sequence[DriveNode]) -> None:
     """Watch that every drive is off and stands still for :data:`STILL_S`.
 
-    Raises
-    ------
-    SafetyRefusal
-        A drive is energised, turns, or does not show its position.
+    Raises SafetyRefusal: a drive is energised, turns, or does not show its position.
     """
     first: dict[int, float] = {}
     for look in range(LOOKS + 1):

@@ -136,10 +136,7 @@ def take_whole_backup(
 def require_read(left_out: Mapping[str, str], path: Path) -> None:
     """Make sure that a backup lacks nothing that the drive has.
 
-    Raises
-    ------
-    Partial
-        An object could not be read; each is named.
+    Raises Partial: an object could not be read; each is named.
     """
     unread = [f"{label}: {why}" for label, why in left_out.items() if why.startswith(UNREAD)]
     if unread:
@@ -287,10 +284,7 @@ def _stated_vendor(sheet: Eds) -> int | None:
 def other_product(eds: str, identity: Identity) -> str:
     """Return a warning where a data sheet is for another product than the drive; empty where it is not, or a table.
 
-    Raises
-    ------
-    ConfigError
-        It is for another vendor.
+    Raises ConfigError: it is for another vendor.
     """
     if eds.partition("#")[0].lower().endswith(".csv"):
         return ""

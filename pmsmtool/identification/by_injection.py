@@ -39,10 +39,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     Where a design or a parameter set was already made from the machine file, another one does not take its place: it
     goes into the folder ``replayed``, with the map and the response that belong to it.
 
-    Raises
-    ------
-    IdentificationError
-        A trap was seen; no machine file is written.
+    Raises IdentificationError: a trap was seen; no machine file is written.
     """
     evaluation = evaluation_of(run, nameplate, request)
     timing = timing_estimates(evaluation.inductance, evaluation.shown, request.tolerance)
@@ -113,10 +110,7 @@ class _Question:
 def evaluation_of(run: RunDirectory, nameplate: MachineFile, request: IdentifyRequest) -> Evaluation:
     """Return what the stored traces say; the last one is kept, as a report is drawn from it right after.
 
-    Raises
-    ------
-    IdentificationError
-        No value can be trusted.
+    Raises IdentificationError: no value can be trusted.
     """
     files = [*trace_files(run), *(path for path in [run.path / REFUSED] if path.is_file())]
     states = tuple((str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in files)

@@ -361,12 +361,8 @@ def evaluated_stage(
 ) -> Stage:
     """Estimate from the stored traces, write the machine file where it is whole, and judge every value.
 
-    Raises
-    ------
-    IdentificationError
-        A trap was seen; no machine file is written.
-    NotAvailable
-        Nothing of what was asked could be told.
+    Raises IdentificationError: a trap was seen; no machine file is written; NotAvailable: nothing of what was asked
+    could be told.
     """
     traces = {name: read_trace(run.path / f"traces/{name}.npz") for name in facts.traces}
     if known is None:
@@ -419,10 +415,7 @@ def facts_name(run: RunDirectory) -> str | None:
 def read_facts(run: RunDirectory) -> PulseFacts | None:
     """Return the facts of a run, None where it has none.
 
-    Raises
-    ------
-    ConfigError
-        They are not what :func:`dump_facts` writes.
+    Raises ConfigError: they are not what :func:`dump_facts` writes.
     """
     name = facts_name(run)
     if name is None:

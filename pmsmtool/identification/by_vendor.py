@@ -138,10 +138,7 @@ def evaluated_stage(
 ) -> Stage:
     """Take over what the drive answered; the machine file is written where one was given to complete.
 
-    Raises
-    ------
-    IdentificationError
-        A result is a number that no machine has.
+    Raises IdentificationError: a result is a number that no machine has.
     """
     by_name = {name: answer for answer in answers for name in answer.values}
     values = vendor_estimates(tuning, by_name)

@@ -106,10 +106,7 @@ def calibrated_traces(traces: Mapping[str, Trace], tolerance: SensorTolerance) -
 
     What the terminals of an undriven machine show (``coast_*``) is neither the DC link's sensor nor the bridge.
 
-    Raises
-    ------
-    NotAvailable
-        The thresholds of the bridge were told, and the DC link they act on is not known.
+    Raises NotAvailable: the thresholds of the bridge were told, and the DC link they act on is not known.
     """
     if tolerance.bridge_difference_v is not None and math.isinf(tolerance.U_dc_v):
         raise NotAvailable(

@@ -70,10 +70,7 @@ class Earlier:
     def measurable(self, quantities: Iterable[str]) -> tuple[str, ...]:
         """Return the quantities of which the run has a value.
 
-        Raises
-        ------
-        ConfigError
-            One that is no single value is asked for, or the run has none of them.
+        Raises ConfigError: one that is no single value is asked for, or the run has none of them.
         """
         asked = tuple(quantities)
         strange = [name for name in asked if name not in COMPARED]
@@ -90,10 +87,7 @@ class Earlier:
 def read_earlier(run: RunDirectory) -> Earlier:
     """Return what a run recorded.
 
-    Raises
-    ------
-    ConfigError
-        It identified nothing that has an interval, or one of its files is gone or damaged.
+    Raises ConfigError: it identified nothing that has an interval, or one of its files is gone or damaged.
     """
     record = run.read()
     if record.stage("identify") is None:

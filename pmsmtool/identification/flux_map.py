@@ -37,10 +37,7 @@ def flux_map_of(
 ) -> FluxMapResult | None:
     """Return the flux map of the pulse trains; None without them, or where the rotor turned and no flux is known.
 
-    Raises
-    ------
-    IdentificationError
-        As the estimator refuses.
+    Raises IdentificationError: as the estimator refuses.
     """
     trains = [traces[f"map_{k}"] for k in range(sum(name.startswith("map_") for name in traces))]
     if not trains or result.resistance is None:

@@ -56,10 +56,7 @@ def frequency_response_of(
 
     ``dead_time_s`` is that of a leg; it displaces the samples of the current.
 
-    Raises
-    ------
-    IdentificationError
-        As the estimator refuses.
+    Raises IdentificationError: as the estimator refuses.
     """
     parts = _records(traces)
     if not parts or result.flux is None or result.encoder is None or result.offset is None:

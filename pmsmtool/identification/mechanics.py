@@ -89,10 +89,7 @@ class Pushes:
     def mechanics(self, *, elastic: bool = False) -> MechanicsResult:
         """Return inertia and friction; ``elastic``: take any torque that a rigid shaft does not explain for noise.
 
-        Raises
-        ------
-        IdentificationError
-            As the estimator refuses.
+        Raises IdentificationError: as the estimator refuses.
         """
         found = estimate_mechanics(
             self.parts,

@@ -150,12 +150,8 @@ class IdentifyRequest:
     def check(self) -> None:
         """Refuse what cannot be asked.
 
-        Raises
-        ------
-        ConfigError
-            An unknown quantity.
-        NotAvailable
-            A quantity that needs a turning shaft, on a shaft that must not turn.
+        Raises ConfigError: an unknown quantity; NotAvailable: a quantity that needs a turning shaft, on a shaft that
+        must not turn.
         """
         unknown = [name for name in self.quantities if name not in NEEDS]
         if unknown or not self.quantities:
@@ -189,13 +185,7 @@ def dump_request(request: IdentifyRequest) -> str:
 
 
 def parse_request(text: str, *, where: str) -> IdentifyRequest:
-    """Return the request of a run.
-
-    Raises
-    ------
-    ConfigError
-        It is not what :func:`dump_request` writes.
-    """
+    """Return the request of a run. Raises ConfigError: it is not what :func:`dump_request` writes."""
     try:
         facts = json.loads(text)
         facts.pop("half_frequency", None)  # of runs before it was taken out

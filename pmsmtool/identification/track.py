@@ -84,10 +84,7 @@ def replay_observations(run: RunDirectory) -> Trace:
     What identification and commissioning record does not serve: their pushes are transients, in which inductance and
     delay decide the voltage, and their steady speeds are too few to tell the noise.
 
-    Raises
-    ------
-    NotAvailable
-        The run is not one of ``track``.
+    Raises NotAvailable: the run is not one of ``track``.
     """
     traces = stored_traces(run)
     if OBSERVATIONS not in traces:
@@ -129,10 +126,7 @@ class Tracked:
 def follow(observations: Trace, known: Known, machine: MachineFile, wanted: Sequence[str] = TRACKED) -> Tracked:
     """Run the filter and add the temperatures.
 
-    Raises
-    ------
-    IdentificationError
-        As :func:`pmsmtool.estimators.tracking.track`.
+    Raises IdentificationError: as :func:`pmsmtool.estimators.tracking.track`.
     """
     found = track(observations, known, wanted)
     values = machine.machine

@@ -232,10 +232,7 @@ def parse_emf_constant(text: str, between: Between | None) -> EmfConstant:
 def line_current(text: str) -> float:
     """Return a line current (A peak): as ``units.parse_current`` reads it, or ``9A block``, by the torque it makes.
 
-    Raises
-    ------
-    ConfigError
-        Not readable, or it is not said what the ampere is.
+    Raises ConfigError: not readable, or it is not said what the ampere is.
     """
     block = _BLOCK_CURRENT.fullmatch(text)
     return parse_current(text) if block is None else PEAK_PER_AMPERE["block"] * _scaled(block[1], block[2])
@@ -244,10 +241,7 @@ def line_current(text: str) -> float:
 def parse_torque_constant(text: str) -> TorqueConstant:
     """Read a torque constant: ``1.74Nm/Arms``, ``85mNm/Apk``, ``12 oz-in/Arms``, ``38.5mNm/A block``.
 
-    Raises
-    ------
-    ConfigError
-        Not readable, or the unit does not say what the ampere is.
+    Raises ConfigError: not readable, or the unit does not say what the ampere is.
     """
     value, written = _torque_number(text)
     if written in ("block", "dc"):
@@ -364,10 +358,7 @@ def machine_from_datasheet(sheet: Datasheet) -> DatasheetResult:
 
     The flux comes from K_e where there is one (no-load, no saturation), else from K_t; K_t then is the check.
 
-    Raises
-    ------
-    ConfigError
-        Neither K_e nor K_t is given.
+    Raises ConfigError: neither K_e nor K_t is given.
     """
     steps: list[Conversion] = []
     warnings: list[str] = []

@@ -275,10 +275,7 @@ def _forward_in_c(struct: FluxMapStruct, i_d: Array, i_q: Array) -> tuple[Array,
 def require_monotonic(flux_map: FluxMap) -> None:
     """Refuse a map whose flux does not rise with the current everywhere: no machine has it, nothing can invert it.
 
-    Raises
-    ------
-    ConfigError
-        At how many of the sampled points, and where it is worst.
+    Raises ConfigError: at how many of the sampled points, and where it is worst.
     """
     i_d, i_q, jac = jacobian_samples(flux_map)
     det = jac[0, 0] * jac[1, 1] - jac[0, 1] * jac[1, 0]

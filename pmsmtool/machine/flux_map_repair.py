@@ -59,10 +59,7 @@ def fill_holes(grid: FluxGrid) -> tuple[FluxGrid, str]:
     Linear data are continued exactly. Returns the filled grid and what was done; refuses when less than half of
     the nodes, or less than four per axis, are known.
 
-    Raises
-    ------
-    ConfigError
-        Too many holes.
+    Raises ConfigError: too many holes.
     """
     from scipy.sparse.linalg import spsolve  # start-up
 

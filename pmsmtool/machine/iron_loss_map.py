@@ -25,10 +25,7 @@ _NAMES = ("i_d_a", "i_q_a", "c_h_w_per_hz", "c_e_w_per_hz2")
 def load_iron_loss_map(path: Path) -> FluxMap:
     """Read a map; its ``psi_d_wb`` carries c_h (W/Hz), its ``psi_q_wb`` carries c_e (W/Hz^2).
 
-    Raises
-    ------
-    ConfigError
-        The file is no archive, lacks an array, or its grids do not fit or are negative.
+    Raises ConfigError: the file is no archive, lacks an array, or its grids do not fit or are negative.
     """
     arrays = read_npz(path)
     missing = [name for name in _NAMES if name not in arrays]

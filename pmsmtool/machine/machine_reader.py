@@ -282,10 +282,7 @@ def flux_map_table(flux_map: FluxMap) -> dict[str, Any]:
 def flux_map_from_table(table: Any) -> FluxMap:
     """Return the map of a table.
 
-    Raises
-    ------
-    ConfigError
-        A key is missing, unknown or not of numbers, or the grids are no map.
+    Raises ConfigError: a key is missing, unknown or not of numbers, or the grids are no map.
     """
     if not isinstance(table, Mapping):
         raise ConfigError("is not a table")

@@ -55,10 +55,7 @@ class _Element:
 def read_mat(path: Path) -> Content:
     """Return the numeric arrays and the structures of them; texts, cells and objects are left out.
 
-    Raises
-    ------
-    ConfigError
-        Missing, another level of the format, or damaged.
+    Raises ConfigError: missing, another level of the format, or damaged.
     """
     where = str(path)
     content = read_bytes(path, largest=_LARGEST_BYTES)

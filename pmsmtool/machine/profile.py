@@ -21,10 +21,7 @@ def profile_names() -> list[str]:
 def machine_path(source: str | Path) -> Path:
     """Return the machine file of a path, a run directory or a profile name; a path that ends in .toml may be missing.
 
-    Raises
-    ------
-    ConfigError
-        There is neither such a file nor such a profile.
+    Raises ConfigError: there is neither such a file nor such a profile.
     """
     path = Path(source)
     if path.suffix == ".toml" or path.is_file():

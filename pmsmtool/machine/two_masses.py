@@ -134,10 +134,7 @@ def damping_nms_per_rad(stiffness_nm_per_rad: float, resonance_rad_s: float, zet
 def mechanics_of(source: MachineFile) -> Mechanics:
     """Return the shaft of a machine file.
 
-    Raises
-    ------
-    ConfigError
-        It has no inertia, or a resonance without the antiresonance below it.
+    Raises ConfigError: it has no inertia, or a resonance without the antiresonance below it.
     """
     machine = source.machine
     if not machine.J_kgm2:

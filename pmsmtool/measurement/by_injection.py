@@ -94,10 +94,7 @@ def _encoder(read: Callable[[str], float]) -> EncoderParameters:
 def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:
     """Return the motion envelope: what the request says, else the drive's ratings.
 
-    Raises
-    ------
-    ConfigError
-        The nameplate has no rated current or speed, and none was given.
+    Raises ConfigError: the nameplate has no rated current or speed, and none was given.
     """
     machine = nameplate.machine
     rated, rpm, i_d_min = machine.I_nom_apk, machine.top_rpm, nameplate.limits.i_d_min_apk

@@ -82,12 +82,8 @@ RPM = RAD_S_PER_RPM
 def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Say) -> PulseFacts:
     """Turn a current vector through one mechanical turn each way; the drive is off on return.
 
-    Raises
-    ------
-    IdentificationError
-        A trap was seen; no number is given.
-    StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
-        As the guard ends the experiment.
+    Raises IdentificationError: a trap was seen; no number is given; StopNotConfirmed, Interrupted, BusError,
+    DriveFault, LimitExceeded: as the guard ends the experiment.
     """
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
@@ -111,12 +107,8 @@ def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Sa
 def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say) -> PulseFacts:
     """Push the shaft by torque and poll it; run it up to its voltage, or let it coast; the drive is off on return.
 
-    Raises
-    ------
-    IdentificationError
-        The shaft does not answer.
-    StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
-        As the guard ends the experiment.
+    Raises IdentificationError: the shaft does not answer; StopNotConfirmed, Interrupted, BusError, DriveFault,
+    LimitExceeded: as the guard ends the experiment.
     """
     largest = envelope.speed_max_rad_s
     plan = PolledPushPlan(
@@ -169,12 +161,8 @@ def _link_v(drive: TorqueCurrent) -> float:
 def swing_and_record(drive: RecorderDrive, envelope: Envelope, keep: Keep, say: Say) -> PulseFacts:
     """Swing the shaft by torque pushes and record them; the drive is off on return.
 
-    Raises
-    ------
-    IdentificationError
-        A trap was seen; no number is given.
-    StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
-        As the guard ends the experiment.
+    Raises IdentificationError: a trap was seen; no number is given; StopNotConfirmed, Interrupted, BusError,
+    DriveFault, LimitExceeded: as the guard ends the experiment.
     """
     pole_pairs = round(drive.read("motor.pole_pairs"))
     U_dc = _link_v(drive)
@@ -216,12 +204,8 @@ def _temperature(drive: RecorderDrive, name: str) -> float | None:
 def envelope_of(drive: CanopenDrive, request: IdentifyRequest, known: MachineFile | None = None) -> Envelope:
     """Return the motion envelope: what the request says, else the least of the drive's ratings and the machine's.
 
-    Raises
-    ------
-    ConfigError
-        The drive's largest speed is no limit, and none was given.
-    SafetyRefusal
-        The drive allows no current.
+    Raises ConfigError: the drive's largest speed is no limit, and none was given; SafetyRefusal: the drive allows no
+    current.
     """
     node = drive.node
     rated = rated_apk(node)

@@ -43,12 +43,8 @@ def identify_vendor(
 ) -> list[VendorAnswer]:
     """Have the drive identify by itself, step by step; it is off and restored on return.
 
-    Raises
-    ------
-    DriveFault, DriveTimeout
-        A step fails or does not end.
-    StopNotConfirmed, Interrupted, BusError, LimitExceeded
-        As the guard ends it.
+    Raises DriveFault, DriveTimeout: a step fails or does not end; StopNotConfirmed, Interrupted, BusError,
+    LimitExceeded: as the guard ends it.
     """
     answers: list[VendorAnswer] = []
     known = _set_values(drive)

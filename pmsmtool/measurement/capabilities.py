@@ -286,10 +286,7 @@ class Capabilities:
     def require(self, quantities: Sequence[str], method: Method | None) -> Method:
         """Return the method that gives all the quantities: the one asked for, else the first that does.
 
-        Raises
-        ------
-        NotAvailable
-            None does; for every quantity the message names what is missing.
+        Raises NotAvailable: none does; for every quantity the message names what is missing.
         """
         for candidate in MEASURING if method is None else (method,):
             if candidate in MEASURING and all(self.row(name, candidate).available for name in quantities):

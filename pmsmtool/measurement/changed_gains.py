@@ -59,10 +59,7 @@ Put = Callable[[GainObject, float], None]
 def gain_address(node: DriveNode, name: str) -> tuple[int, int]:
     """Return where a drive keeps a gain: by its map, by what the map says of a gain without unit, else by CiA 402.
 
-    Raises
-    ------
-    NotAvailable
-        The drive has none of these objects.
+    Raises NotAvailable: the drive has none of these objects.
     """
     if name in node.map.cells:
         return node.map.address(name)
@@ -86,10 +83,8 @@ def named_addresses(node: DriveNode, name: str) -> list[tuple[int, int]]:
 def gain_object(node: DriveNode, name: str, index: int, sub: int) -> GainObject:
     """Return the object of a gain, its type by the map, else by its size.
 
-    Raises
-    ------
-    NotAvailable
-        The drive has no such object, or its type is not known, or it is too small to be changed by a known ratio.
+    Raises NotAvailable: the drive has no such object, or its type is not known, or it is too small to be changed by a
+    known ratio.
     """
     cell = node.map.cells.get(name)
     wire = LETTERS[cell.wire] if cell is not None and (cell.index, cell.sub) == (index, sub) else None
@@ -121,10 +116,7 @@ def gain_object(node: DriveNode, name: str, index: int, sub: int) -> GainObject:
 def changed_counts(gain: GainObject, ratio: float) -> float:
     """Return counts in about a ratio to those held: whole ones, but of a REAL32.
 
-    Raises
-    ------
-    NotAvailable
-        Whole counts are too coarse for it, or it holds no gain.
+    Raises NotAvailable: whole counts are too coarse for it, or it holds no gain.
     """
     counts = gain.counts * ratio
     if gain.item.letter == "f":
@@ -144,10 +136,7 @@ def changed_counts(gain: GainObject, ratio: float) -> float:
 def refuse_unsafe(node: DriveNode, envelope: Envelope) -> None:
     """Refuse what rules out a change of gains: a drive that saves by itself, a coupled shaft, gravity, a turning shaft.
 
-    Raises
-    ------
-    SafetyRefusal
-        With what it is.
+    Raises SafetyRefusal: with what it is.
     """
     if envelope.shaft != "free" or envelope.load != "none":
         raise SafetyRefusal(

@@ -43,10 +43,7 @@ def measure_frequency_response(
 
     ``planned`` is told the plan before anything of it moves the shaft.
 
-    Raises
-    ------
-    SafetyRefusal
-        The envelope leaves no current for the sequence.
+    Raises SafetyRefusal: the envelope leaves no current for the sequence.
     """
     pole_pairs = round(drive.read("motor.pole_pairs"))
     psi, J = drive.read("motor.psi_f_wb"), drive.read("motor.J_kgm2")

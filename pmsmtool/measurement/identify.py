@@ -95,12 +95,8 @@ OF_LEVEL: Mapping[CapabilityLevel, Method] = {
 def open_for_level(connection: Connection, node: int, found: Capabilities) -> CanopenDrive:
     """Return the port that fits what a drive has.
 
-    Raises
-    ------
-    ConfigError
-        The map is that of another drive: nothing is moved or written through it.
-    NotAvailable
-        It lacks what even its capability level needs.
+    Raises ConfigError: the map is that of another drive: nothing is moved or written through it; NotAvailable: it lacks
+    what even its capability level needs.
     """
     check_motion(found.drive_map, found.identity)
     method = Method.INJECT if found.unsafe else OF_LEVEL.get(found.level)
@@ -207,10 +203,7 @@ def identify_after_drive(
 ) -> Stage:
     """Have the drive identify by itself, then measure what its objects allow besides; one stage of both.
 
-    Raises
-    ------
-    PmsmtoolError
-        As either ends.
+    Raises PmsmtoolError: as either ends.
     """
     asked = replace(request, quantities=vendor_quantities(found))
     own = identify(run, drive, asked, allow_motion, say, method=Method.VENDOR, found=found, known=known)

@@ -139,12 +139,8 @@ def learn_speed_loop(
 ) -> LearnedLoop:
     """Measure the speed loop with the drive's own gains and with each changed; the drive is as before on return.
 
-    Raises
-    ------
-    SafetyRefusal, LimitExceeded
-        Refused, or the loop began to oscillate: the voltage is off and the gains are back.
-    NotAvailable
-        The drive does not follow its velocity mode, or a gain cannot be changed.
+    Raises SafetyRefusal, LimitExceeded: refused, or the loop began to oscillate: the voltage is off and the gains are
+    back; NotAvailable: the drive does not follow its velocity mode, or a gain cannot be changed.
     """
     refuse_unsafe(drive.node, envelope)
     _refuse_turning(drive)

@@ -59,10 +59,7 @@ def learn_position_gain(
     What was learned of other gains stays where this is refused: that is the reason then. A limit of the motion that
     stopped the shaft is returned beside it, for the caller to raise.
 
-    Raises
-    ------
-    DriveTimeout, DriveFault
-        The drive no longer does as it is told: the voltage is off and the gains are back.
+    Raises DriveTimeout, DriveFault: the drive no longer does as it is told: the voltage is off and the gains are back.
     """
     try:
         drive = PositionDrive(connection, node.node, drive_map=node.map)

@@ -151,10 +151,7 @@ class Measurement:
     def run(self, quantities: tuple[str, ...]) -> None:
         """Run what the quantities need; what is refused (:attr:`refused`) takes along only what depends on it.
 
-        Raises
-        ------
-        IdentificationError
-            Noise, phases, encoder counts or current sensors: nothing more is moved.
+        Raises IdentificationError: noise, phases, encoder counts or current sensors: nothing more is moved.
         """
         steps = steps_of(quantities, self.held)
         if self.drive.read(COMPENSATION) != 0.0:

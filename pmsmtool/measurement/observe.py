@@ -67,12 +67,7 @@ def observe_process_data(
 ) -> None:
     """Collect what the drive sends by itself, ``rate_hz`` times a second.
 
-    Raises
-    ------
-    NotAvailable
-        The drive cannot send these quantities.
-    ConfigError
-        Nothing arrived.
+    Raises NotAvailable: the drive cannot send these quantities; ConfigError: nothing arrived.
     """
     clock = node.connection.clock
     rows: list[tuple[float, ...]] = []
@@ -130,10 +125,7 @@ def without_gaps(rows: Array, asked_s: float) -> tuple[float, list[Trace]]:
 def observe_recordings(drive: CanopenDrive, seconds: float, seen: Observations, say: Say = lambda text: None) -> None:
     """Collect recordings of the drive's trace recorder, one after the other; its set-up is brought back.
 
-    Raises
-    ------
-    NotAvailable
-        The drive has no recorder, or not these signals.
+    Raises NotAvailable: the drive has no recorder, or not these signals.
     """
     clock = drive.node.connection.clock
     decimation = max(1, round(RECORD_S / (RECORD_ROWS * drive.period_s)))

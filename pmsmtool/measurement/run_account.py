@@ -167,10 +167,7 @@ class RunAccount:
 def accounted(run: RunDirectory, stage: str, tell: Say) -> Iterator[Say]:
     """Keep the account of a run that is one stage, and record the stage when an error ends it; yields what to say by.
 
-    Raises
-    ------
-    ConfigError
-        The run cannot be written; nothing has moved yet.
+    Raises ConfigError: the run cannot be written; nothing has moved yet.
     """
     account = RunAccount(run, tell)
     with account.kept():

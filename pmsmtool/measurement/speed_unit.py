@@ -26,10 +26,7 @@ def find_speed_unit(guard: GuardedDrive, drive: SpeedLoopDrive, aim_rad_s: float
     It begins with the smallest number of counts, and asks for more only while the shaft turns slower than wanted: the
     speed that is commanded never exceeds ``GROWTH`` times the one that was seen, or the speed that is wanted.
 
-    Raises
-    ------
-    NotAvailable
-        The shaft does not follow.
+    Raises NotAvailable: the shaft does not follow.
     """
     per_count = drive.rad_s_per_count
     for _ in range(TRIES):

@@ -72,10 +72,7 @@ class Compiler:
 def zig_compiler(target: Target | None) -> Compiler:
     """Return the installed ziglang as a compiler for a platform (None: the one it runs on), baseline CPU.
 
-    Raises
-    ------
-    CompilerError
-        ziglang is not importable.
+    Raises CompilerError: ziglang is not importable.
     """
     spec = importlib.util.find_spec("ziglang")
     if spec is None or not spec.submodule_search_locations:
@@ -96,10 +93,7 @@ def system_compiler() -> tuple[Compiler | None, list[str]]:
 
     ``CC`` is obeyed: when it is set nothing else is tried, and a ``CC`` that does not work is an error.
 
-    Raises
-    ------
-    CompilerError
-        ``CC`` is set and does not work.
+    Raises CompilerError: ``CC`` is set and does not work.
     """
     chosen = os.environ.get("CC", "").strip()
     if chosen == ZIG:

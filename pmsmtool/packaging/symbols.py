@@ -52,10 +52,7 @@ class Binary:
 def read_binary(data: bytes) -> Binary:
     """Return the facts of a library or object file.
 
-    Raises
-    ------
-    ValueError
-        Not a 64-bit little-endian ELF, PE or Mach-O file.
+    Raises ValueError: not a 64-bit little-endian ELF, PE or Mach-O file.
     """
     try:
         if data[:6] == b"\x7fELF\x02\x01":

@@ -22,13 +22,7 @@ _WIDTH, _HEIGHT = 7.5, 2.6
 
 
 def figure_of(found: Reproduction, title: str) -> Figure:
-    """Return the panels of a reproduction as one figure.
-
-    Raises
-    ------
-    ConfigError
-        It is a table without a plot.
-    """
+    """Return the panels of a reproduction as one figure. Raises ConfigError: it is a table without a plot."""
     if not found.panels:
         raise ConfigError(f"a table, there is nothing to plot: {title}", where="reproduce", hint="leave --plot out")
     from matplotlib.figure import Figure

@@ -170,10 +170,7 @@ def machine_file(delay_periods: float = 1.5) -> MachineFile:
 def parameter_set(controller: Controller, source: MachineFile) -> ParameterSet:
     """Return the drive parameters of a controller on a machine: as ``tune`` makes them, then its own changes.
 
-    Raises
-    ------
-    DesignInfeasible
-        The law does not hold for this machine.
+    Raises DesignInfeasible: the law does not hold for this machine.
     """
     request = controller.request
     if controller.law:

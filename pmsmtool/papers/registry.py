@@ -81,13 +81,7 @@ FIGURES: tuple[Row, ...] = (
 
 
 def find(name: str) -> Row:
-    """Return the row of a figure.
-
-    Raises
-    ------
-    ConfigError
-        No figure has that name.
-    """
+    """Return the row of a figure. Raises ConfigError: no figure has that name."""
     for row in FIGURES:
         if row.name == name:
             return row

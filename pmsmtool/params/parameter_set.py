@@ -113,11 +113,8 @@ class ParameterSet:
 def parse_parameter_set(text: str, where: str = "params.toml") -> ParameterSet:
     """Read the text of a parameter set.
 
-    Raises
-    ------
-    ConfigError
-        Not TOML, wrong schema, unknown names, values that are no numbers, or a content hash that
-        does not fit the content; all violations at once.
+    Raises ConfigError: not TOML, wrong schema, unknown names, values that are no numbers, or a content hash that does
+    not fit the content; all violations at once.
     """
     document = parse_toml(text, where=where)
     schema = document.pop("schema", None)

@@ -230,12 +230,8 @@ class ProofPlan:
 def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
     """Return the experiments that fit a design within an envelope.
 
-    Raises
-    ------
-    NotAvailable
-        Not even current steps fit, or the design is for a drive that Hall sensors alone commutate.
-    ConfigError
-        The design gives no rated current.
+    Raises NotAvailable: not even current steps fit, or the design is for a drive that Hall sensors alone commutate;
+    ConfigError: the design gives no rated current.
     """
     if design["hall.commutation"] >= HallCommutation.ALONE:
         raise NotAvailable(

@@ -53,13 +53,7 @@ def to_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
 
 @next_step(NEXT_STEP)
 def from_arrays(arrays: Mapping[str, NDArray[Any]], *, where: str = "prediction") -> Prediction:
-    """Read what :func:`to_arrays` made.
-
-    Raises
-    ------
-    ConfigError
-        It is not a prediction.
-    """
+    """Read what :func:`to_arrays` made. Raises ConfigError: it is not a prediction."""
     try:
         facts = json.loads(str(arrays["_meta"]))
         if facts["schema"] != SCHEMA:

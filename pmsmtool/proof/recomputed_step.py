@@ -96,12 +96,8 @@ class StepTask:
 def step_task(design: Design, drawn: int = DRAWN) -> StepTask:
     """Return the step of a design.
 
-    Raises
-    ------
-    NotAvailable
-        The machine saturates: its flux map does not go into the page.
-    ConfigError
-        The design cannot be simulated.
+    Raises NotAvailable: the machine saturates: its flux map does not go into the page; ConfigError: the design cannot
+    be simulated.
     """
     if design.machine.flux_map is not None:
         raise NotAvailable("the machine saturates, and its flux map is not in the page")

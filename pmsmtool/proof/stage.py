@@ -240,13 +240,7 @@ def _beyond(design: Design, conditions: Conditions) -> list[str]:
 
 
 def _shown(plan: ProofPlan, names: tuple[str, ...]) -> ProofPlan:
-    """Return the plan without the experiments that the drive cannot show.
-
-    Raises
-    ------
-    NotAvailable
-        Nothing is left.
-    """
+    """Return the plan without the experiments that the drive cannot show. Raises NotAvailable: nothing is left."""
     if not names:
         return plan
     left = tuple(f"{e.text}: the drive has no excitation" for e in plan.experiments if e.name not in names)
@@ -259,10 +253,7 @@ def _shown(plan: ProofPlan, names: tuple[str, ...]) -> ProofPlan:
 def refuse_other_set(node: DriveNode, design: Design) -> None:
     """Refuse a drive that does not hold the design's bytes.
 
-    Raises
-    ------
-    VerifyMismatch
-        Every object that holds something else.
+    Raises VerifyMismatch: every object that holds something else.
     """
     plan = plan_download(node, design.parameter_set())
     if plan.changes:
@@ -300,10 +291,7 @@ def conditions_of(drive: CanopenDrive, envelope: Envelope) -> Conditions:
 def commit(run: RunDirectory, prediction: Prediction) -> tuple[str, str]:
     """Write a prediction, sync it to the disk, and return its SHA-256 (hex) and its folder in the run.
 
-    Raises
-    ------
-    ConfigError
-        It cannot be written: then nothing may be moved.
+    Raises ConfigError: it cannot be written: then nothing may be moved.
     """
     data = npz_bytes(to_arrays(prediction))
     digest = hashlib.sha256(data).hexdigest()
@@ -347,13 +335,7 @@ def responses(traces: Mapping[str, Trace], prediction: Prediction) -> dict[tuple
 
 
 def read_proof(folder: Path) -> tuple[Prediction, dict[str, Trace]]:
-    """Read prediction and traces of a proof again.
-
-    Raises
-    ------
-    ConfigError
-        A file is missing or damaged.
-    """
+    """Read prediction and traces of a proof again. Raises ConfigError: a file is missing or damaged."""
     prediction = from_arrays(read_npz(folder / PREDICTION), where=str(folder / PREDICTION))
     names = [name for name in prediction.t_s if (folder / f"{name}.npz").is_file()]
     return prediction, {name: read_trace(folder / f"{name}.npz") for name in names}

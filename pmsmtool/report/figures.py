@@ -310,7 +310,7 @@ def bands_figure(groups: Mapping[str, Mapping[str, tuple[float, float, float, fl
 
 
 def margin_figure(report: MarginReport) -> Figure:
-    """Draw margins and headroom from the worst corner to the 95 % quantile, else the nominal value; no delay margins."""
+    """Draw margins and headroom from the worst corner to the 95 % quantile, else nominal; no delay margins."""
     groups: dict[str, dict[str, tuple[float, float, float, float]]] = {}
     for spread in (row for row in (*report.loops, *report.headroom) if row.unit != "us"):
         high = spread.percentiles.get(95.0, spread.nominal)

@@ -61,10 +61,7 @@ PANELS: tuple[Panel, ...] = (
 def trace_figure(trace: Trace, panels: Sequence[Panel] = PANELS, title: str = "") -> Figure:
     """Return a figure of a trace, one panel below the other over the same time.
 
-    Raises
-    ------
-    ValueError
-        The trace has none of the signals.
+    Raises ValueError: the trace has none of the signals.
     """
     from matplotlib.figure import Figure
 

@@ -142,10 +142,8 @@ class PmsmSimBus(can.BusABC):
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Send a frame; returns when it has left, in virtual time.
 
-        Raises
-        ------
-        can.CanOperationError
-            The bus is shut down, the adapter was pulled (fault injection), or nobody acknowledges.
+        Raises can.CanOperationError: the bus is shut down, the adapter was pulled (fault injection), or nobody
+        acknowledges.
         """
         self._check_usable()
         if msg.is_fd or msg.is_error_frame:

@@ -156,10 +156,7 @@ _OLDER = {"tier": "level"}
 def parse_channel(text: str | None) -> Channel:
     """Return the channel a string describes; None is the default profile.
 
-    Raises
-    ------
-    ConfigError
-        Everything that is wrong with the string.
+    Raises ConfigError: everything that is wrong with the string.
     """
     name, begun, query = (text or "").partition("?")
     values: dict[str, Any] = {}
@@ -200,10 +197,7 @@ def _storage(channel: Channel, stem: str, position: int) -> Storage:
 def _face(channel: Channel, machine_file: MachineFile) -> DriveFace | None:
     """Return what the channel's drives show instead of the reference drive's whole dictionary.
 
-    Raises
-    ------
-    ConfigError
-        There is no such family or file, or a level of a family that is not the reference drive.
+    Raises ConfigError: there is no such family or file, or a level of a family that is not the reference drive.
     """
     if channel.eds is not None:
         return _makers_drive(channel, machine_file)

@@ -76,10 +76,7 @@ def drive_values(machine_file: MachineFile, params: ParameterSet) -> dict[str, f
 def image_of(machine_file: MachineFile, params: ParameterSet) -> bytes:
     """Return the parameter image of the simulated drive.
 
-    Raises
-    ------
-    ConfigError
-        Values out of range, or tables that do not fit their descriptor.
+    Raises ConfigError: values out of range, or tables that do not fit their descriptor.
     """
     values = drive_values(machine_file, params)
     if not params.tables:

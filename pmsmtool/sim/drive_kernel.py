@@ -180,10 +180,7 @@ class KernelCore:
     def excite(self, excitation: Excitation | None) -> None:
         """Start an excitation, change the running one, or end it with None.
 
-        Raises
-        ------
-        ConfigError
-            The buffer is longer than the drive's.
+        Raises ConfigError: the buffer is longer than the drive's.
         """
         out = self.simulation.excitation
         if excitation is None:
@@ -221,10 +218,7 @@ class KernelCore:
     def record(self, setup: RecorderSetup | None) -> None:
         """Arm the recorder, or stop it with None.
 
-        Raises
-        ------
-        ConfigError
-            Too many channels, or rows that do not fit the memory.
+        Raises ConfigError: too many channels, or rows that do not fit the memory.
         """
         out = self.simulation.recorder
         if setup is None:

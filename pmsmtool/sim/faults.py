@@ -266,13 +266,7 @@ _TABLES = ("frame", "drive", "adapter", "refuse", "lie", "absent", "store")
 
 @next_step(NEXT_STEP)
 def parse_faults(text: str, where: str = "faults") -> FaultPlan:
-    """Return the plan a TOML text describes.
-
-    Raises
-    ------
-    ConfigError
-        Everything that is wrong with the text.
-    """
+    """Return the plan a TOML text describes. Raises ConfigError: everything that is wrong with the text."""
     document = parse_toml(text, where=where)
     reader = _Reader()
     for name in document:
@@ -330,11 +324,5 @@ def _plan(reader: _Reader, document: Mapping[str, Any]) -> FaultPlan:
 
 @next_step(NEXT_STEP)
 def load_faults(path: Path) -> FaultPlan:
-    """Read a faults file.
-
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, or everything that is wrong in it.
-    """
+    """Read a faults file. Raises ConfigError: the file cannot be read, or everything that is wrong in it."""
     return parse_faults(read_text(path), where=str(path))

@@ -130,10 +130,7 @@ _SHARED: tuple[tuple[int, type[ctypes.Structure]], ...] = (
 def library() -> Any:
     """Return the kernel with its functions declared.
 
-    Raises
-    ------
-    RuntimeError
-        A struct has another size in the library: it was built from other sources.
+    Raises RuntimeError: a struct has another size in the library: it was built from other sources.
     """
     lib = native.load("pmsm_sim")
     lib.pmsm_sim_layout.argtypes, lib.pmsm_sim_layout.restype = (_u32,), _u32
@@ -270,10 +267,7 @@ class Simulation:
     def schedule(self, target: Target, t_s: Sequence[float] | Array, value: Sequence[float] | Array) -> None:
         """Let a target follow a piecewise linear function; two nodes at one time make a step.
 
-        Raises
-        ------
-        ConfigError
-            Lengths differ, no nodes, or times that decrease.
+        Raises ConfigError: lengths differ, no nodes, or times that decrease.
         """
         t, v = np.ascontiguousarray(t_s, dtype=float), np.ascontiguousarray(value, dtype=float)
         if t.shape != v.shape or t.ndim != 1 or not len(t) or np.any(np.diff(t) < 0.0) or not np.all(np.isfinite(v)):

@@ -38,10 +38,7 @@ Say = Callable[[str], None]
 def operate(line: Line, machine_file: MachineFile, say: Say = lambda text: None) -> None:
     """Set every drive of a line going, and let it boot and start before anybody joins: nobody sees it reset.
 
-    Raises
-    ------
-    ConfigError, DesignInfeasible
-        As :class:`Operation`.
+    Raises ConfigError, DesignInfeasible: as :class:`Operation`.
     """
     operations = [Operation(node, machine_file, say) for node in line.nodes]
     last = line.clock.now() + START_S

@@ -156,13 +156,7 @@ KEYS: tuple[Key, ...] = (
 
 @next_step(NEXT_STEP)
 def load_scenario(path: Path) -> Scenario:
-    """Read a scenario file.
-
-    Raises
-    ------
-    ConfigError
-        It cannot be read, or everything that is wrong in it.
-    """
+    """Read a scenario file. Raises ConfigError: it cannot be read, or everything that is wrong in it."""
     where = str(path)
     tables = read_toml(Path(path), hint=f"or one of {', '.join(BUILT_IN)}")
     if tables.pop("schema", None) != SCHEMA:
@@ -362,10 +356,7 @@ BUILT_IN: dict[str, tuple[str, Callable[[_Scale, str], Scenario]]] = {
 def built_in(name: str, machine_file: MachineFile, values: Mapping[str, float]) -> Scenario:
     """Return a built-in scenario sized for a machine and its drive's parameters.
 
-    Raises
-    ------
-    ConfigError
-        No scenario has that name.
+    Raises ConfigError: no scenario has that name.
     """
     if name not in BUILT_IN:
         raise ConfigError(

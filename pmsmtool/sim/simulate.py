@@ -82,10 +82,7 @@ def find_drive(source: str | Path | Design | MachineFile, params: Path | None = 
 def find_scenario(name: str, drive: SimulatedDrive) -> Scenario:
     """Return a scenario file, or a built-in scenario sized for the drive.
 
-    Raises
-    ------
-    ConfigError
-        Neither a file nor a built-in name, or what is wrong with the file.
+    Raises ConfigError: neither a file nor a built-in name, or what is wrong with the file.
     """
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():

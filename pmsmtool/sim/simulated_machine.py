@@ -89,10 +89,7 @@ def settings_of(machine_file: MachineFile) -> Settings:
     Two swapped leads are resolved here. They mirror the machine: with its shaft counted along the phase order of the
     drive, it is the same machine with an encoder that counts the other way and has the opposite offset and angle.
 
-    Raises
-    ------
-    ConfigError
-        ``drive_fault`` names no fault.
+    Raises ConfigError: ``drive_fault`` names no fault.
     """
     values = machine_file.simulation_settings()
     if "encoder_reversed" not in machine_file.simulation:
@@ -120,10 +117,7 @@ def settings_of(machine_file: MachineFile) -> Settings:
 def with_simulation(machine_file: MachineFile, changes: Mapping[str, Value]) -> MachineFile:
     """Return the machine with other simulation keys; they are checked as in a file.
 
-    Raises
-    ------
-    ConfigError
-        An unknown key or a bad value.
+    Raises ConfigError: an unknown key or a bad value.
     """
     from pmsmtool.machine.key import check_table
     from pmsmtool.machine.simulation_keys import SIMULATION_KEYS

@@ -92,10 +92,7 @@ class CurrentChoice:
 def choose_current(source: MachineFile, request: TuneRequest, I_max_apk: float) -> CurrentChoice:
     """Choose the bandwidth.
 
-    Raises
-    ------
-    DesignInfeasible
-        The bandwidth asked for does not reach the margins asked for; the hint names one that does.
+    Raises DesignInfeasible: the bandwidth asked for does not reach the margins asked for; the hint names one that does.
     """
     machine, inverter = source.machine, source.inverter
     if request.predictor and inverter.delay_periods < 1.0:

@@ -90,10 +90,7 @@ def imc(R: float, L: float, alpha: float) -> CurrentGains:
 def second_order(R: float, L: float, omega_n: float, zeta: float) -> CurrentGains:
     """Place s^2 + 2 zeta w_n s + w_n^2: K_p = 2 zeta w_n L - R, K_i = w_n^2 L.
 
-    Raises
-    ------
-    DesignInfeasible
-        When K_p would not be positive: the plant alone is already faster than that.
+    Raises DesignInfeasible: when K_p would not be positive: the plant alone is already faster than that.
     """
     K_p = 2.0 * zeta * omega_n * L - R
     if K_p <= 0.0:

@@ -112,10 +112,7 @@ def small_time_constants(path: SpeedPath, alpha_current: float) -> float:
 def symmetric_optimum(J: float, T_sum: float, a: float) -> SpeedGains:
     """Place the crossover 1 / (a T_sum) at the phase maximum atan(a) - atan(1/a).
 
-    Raises
-    ------
-    DesignInfeasible
-        When a <= 1: the crossover would lie beyond the small time constants.
+    Raises DesignInfeasible: when a <= 1: the crossover would lie beyond the small time constants.
     """
     if a <= 1.0:
         raise DesignInfeasible(
@@ -134,10 +131,7 @@ def symmetric_ratio(phase_margin_rad: float) -> float:
 def pole_placement(J: float, B: float, omega_n: float, zeta: float) -> SpeedGains:
     """Place J s^2 + (B + K_p) s + K_i: K_p = 2 zeta w_n J - B, K_i = w_n^2 J.
 
-    Raises
-    ------
-    DesignInfeasible
-        When friction alone damps more than asked.
+    Raises DesignInfeasible: when friction alone damps more than asked.
     """
     K_p = 2.0 * zeta * omega_n * J - B
     if K_p <= 0.0:
@@ -171,10 +165,7 @@ _SLOWER, _SLOWER_STEPS = 0.85, 40
 def slowed(gains: SpeedGains, paths: Sequence[SpeedPath]) -> SpeedGains:
     """Return gains of the same shape, as slow as all paths, the nominal one first, need to keep their margins.
 
-    Raises
-    ------
-    DesignInfeasible
-        None does.
+    Raises DesignInfeasible: none does.
     """
     for k in range(_SLOWER_STEPS):
         share = _SLOWER**k

@@ -73,10 +73,7 @@ class CommandedRecorder(Recorder):
     def room(self, signals: Sequence[str]) -> int:
         """Return how many samples of signals fit; they are chosen on the drive.
 
-        Raises
-        ------
-        NotAvailable
-            It does not have these signals.
+        Raises NotAvailable: it does not have these signals.
         """
 
     @abstractmethod
@@ -96,12 +93,8 @@ class CommandedRecorder(Recorder):
     ) -> None:  # fmt: skip
         """Choose the signals and record them from now on.
 
-        Raises
-        ------
-        NotAvailable
-            Not these signals, not this much memory, or a trigger it has not.
-        VerifyMismatch
-            The drive has taken something else.
+        Raises NotAvailable: not these signals, not this much memory, or a trigger it has not; VerifyMismatch: the drive
+        has taken something else.
         """
         self._begin_arming(samples, decimation, pretrigger, at_excitation=at_excitation or at_move)
         largest = self.room(signals)

@@ -45,10 +45,7 @@ class Recorder:
     ) -> None:  # fmt: skip
         """Set the recorder up and arm it: from now on, from an excitation on, or from the begin of a move on.
 
-        Raises
-        ------
-        NotAvailable
-            The drive has no recorder, or not these signals, or not this much memory.
+        Raises NotAvailable: the drive has no recorder, or not these signals, or not this much memory.
         """
         self._check_room(signals, samples)
         self._select(objects.TRACE_CHANNELS, signals)
@@ -161,10 +158,7 @@ class Recorder:
     def start_average(self, signals: Sequence[str], periods: int) -> None:
         """Start the mean over the next ``periods`` control periods.
 
-        Raises
-        ------
-        NotAvailable
-            The drive has no such signals, or too few channels.
+        Raises NotAvailable: the drive has no such signals, or too few channels.
         """
         unknown = [name for name in signals if name not in LIVE]
         if unknown or len(signals) > len(objects.AVERAGE_CHANNELS):

@@ -178,10 +178,7 @@ def mean_inverter_error(
 def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]]) -> None:
     """Refuse a run that was limited or not settled, or that has too few speeds.
 
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``.
+    Raises IdentificationError: ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``.
     """
     w = speeds["omega_e_rad_s"]
     for sign, name in ((1.0, "forward"), (-1.0, "backward")):

@@ -47,10 +47,7 @@ def flux_by_undriven_voltage(
 ) -> Estimate:
     """Return the flux linkage (Wb) from ``theta_M_rad``, ``u_d_v`` and ``u_q_v`` of a coasting machine.
 
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: too few rows, or no speed in one of the directions.
+    Raises IdentificationError: ``E_EXCITATION``: too few rows, or no speed in one of the directions.
     """
     rows = [row for coast in coasts for row in _means(coast, pole_pairs)]
     if len(rows) < BLOCKS or not min(rows)[0] < 0.0 < max(rows)[0]:

@@ -199,11 +199,8 @@ def assumptions_of(file: str, machine_file: MachineFile | None = None) -> tuple[
     That is the modes of operation, where the file does not announce them, and what of a motor its limits cannot hold;
     before them stands how odd lines of the file are read.
 
-    Raises
-    ------
-    ConfigError
-        As ``file_rows.read_makers_objects``; or, with a motor, the file is that of the reference drive, which is
-        simulated itself.
+    Raises ConfigError: as ``file_rows.read_makers_objects``; or, with a motor, the file is that of the reference drive,
+    which is simulated itself.
     """
     objects = read_makers_objects(file)
     if machine_file is not None and objects.stored(0x1018, 1) == VENDOR:

@@ -100,10 +100,7 @@ class MakersObjects:
 def read_makers_objects(where: str) -> MakersObjects:
     """Return the objects of an EDS, a DCF, or of one family of a table (``FILE.csv#FAMILY``).
 
-    Raises
-    ------
-    ConfigError
-        The file cannot be read, holds no objects, or is no file of a drive (CiA 402).
+    Raises ConfigError: the file cannot be read, holds no objects, or is no file of a drive (CiA 402).
     """
     name, _, family = where.partition(FAMILY_MARK)
     path = Path(name)

@@ -84,10 +84,7 @@ class Entry:
     def check(self, data: bytes) -> None:
         """Refuse bytes of a wrong length or outside the bounds.
 
-        Raises
-        ------
-        Refused
-            0x06070012/13 for the length, 0x06090030/31/32 for the value.
+        Raises Refused: 0x06070012/13 for the length, 0x06090030/31/32 for the value.
         """
         size = self.size
         if size and len(data) != size:
@@ -140,13 +137,7 @@ class Dictionary:
         return self.by_key[key]
 
     def find(self, index: int, sub: int) -> Entry:
-        """Return an entry.
-
-        Raises
-        ------
-        Refused
-            0x06020000 or 0x06090011.
-        """
+        """Return an entry. Raises Refused: 0x06020000 or 0x06090011."""
         entry = self._entries.get(index << 8 | sub)
         if entry is None:
             raise Refused(AbortCode.NO_SUBINDEX if index in self._indices else AbortCode.NO_OBJECT)
@@ -155,10 +146,7 @@ class Dictionary:
     def hide(self, index: int, sub: int | None = None) -> None:
         """Fault injection: answer as if there were no such object; the application still finds it by key.
 
-        Raises
-        ------
-        ConfigError
-            There is no such object.
+        Raises ConfigError: there is no such object.
         """
         hidden = [key for key in self._entries if key >> 8 == index and sub in (None, key & 0xFF)]
         if not hidden and index not in self._hidden:
@@ -194,10 +182,7 @@ class Dictionary:
     def write(self, entry: Entry, data: bytes) -> bool:
         """Write an entry; returns True when the application confirms it later.
 
-        Raises
-        ------
-        Refused
-            Wrong length, out of range, or the application's own reason.
+        Raises Refused: wrong length, out of range, or the application's own reason.
         """
         entry.check(data)
         if entry.sink is not None:

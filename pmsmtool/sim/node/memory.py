@@ -140,10 +140,7 @@ class Memory:
     def store(self, content: bytes) -> Iterator[None]:
         """Store content step by step: every ``next`` performs one write, the iterator's end means stored.
 
-        Raises
-        ------
-        ValueError
-            The content does not fit a slot.
+        Raises ValueError: the content does not fit a slot.
         """
         if len(content) > SLOT_BYTES - PAGE_BYTES:
             raise ValueError(f"{len(content)} bytes do not fit the memory")

@@ -139,10 +139,7 @@ def object_rows() -> tuple[ObjectRow, ...]:
 def build_rows(path: Path) -> tuple[ObjectRow, ...]:
     """Return the rows of a table file and of the catalogue.
 
-    Raises
-    ------
-    ValueError
-        Two rows name the same object, or one misses its container.
+    Raises ValueError: two rows name the same object, or one misses its container.
     """
     with path.open(encoding="ascii", newline="") as file:
         rows = [_csv_row(fields) for fields in csv.DictReader(file)]
