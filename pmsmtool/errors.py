@@ -111,10 +111,7 @@ class ConfigError(PmsmtoolError, ValueError):
 def next_step(hint: str) -> Iterator[None]:
     """Give what is refused inside a next step, where it names none of its own; also a decorator, of a format's reader.
 
-    Parameters
-    ----------
-    hint : str
-        What to do with a file of this format that cannot be used.
+    ``hint``: what to do with a file of this format that cannot be used.
     """
     try:
         yield

@@ -188,10 +188,7 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     to the gains, and what Coulomb friction adds. Stored gains with margins beyond :data:`LOOSEST` at a
     corner of the box are not kept, and the design says so.
 
-    Parameters
-    ----------
-    stored : mapping
-        What the drive holds, by catalogue name; without all gains of its controller nothing is compared.
+    ``stored``: what the drive holds, by catalogue name; without all gains of its controller nothing is compared.
     """
     design, box = made.design, made.box
     speed, position = _stored_gains(stored, made, drive)

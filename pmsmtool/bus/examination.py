@@ -102,10 +102,7 @@ class _Complaints(logging.Handler):
 def examine(connection: Connection, bitrate: int | None, *, listen_s: float = LISTEN_S) -> Examination:
     """Listen first, then ask; nothing is written to any node.
 
-    Parameters
-    ----------
-    bitrate : int or None
-        To turn frame lengths into bus load.
+    ``bitrate``: to turn frame lengths into bus load.
     """
     bits = _Bits(connection)
     before, errors_before = connection.frames_received, connection.error_frames

@@ -49,10 +49,7 @@ class LssAddress:
 class LssMaster:
     """Master of the layer setting services on one bus.
 
-    Parameters
-    ----------
-    connection : Connection
-        The bus; no other LSS master may be on it.
+    ``connection``: the bus; no other LSS master may be on it.
     """
 
     def __init__(self, connection: Connection) -> None:

@@ -209,10 +209,7 @@ class SdoChannel:
     def limited(self, *, silence_s: float, own_s: float, total_s: float) -> Iterator[None]:
         """Inside, raise ``OutOfTime`` when no transfer was answered whole for ``silence_s``, or after ``total_s``.
 
-        Parameters
-        ----------
-        own_s : float
-            What the transfers inside have at least, where the node was silent before (s).
+        ``own_s``: what the transfers inside have at least, where the node was silent before (s).
         """
         before = self._over_s, self._silence_s
         now = self.connection.clock.now()

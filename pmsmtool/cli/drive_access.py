@@ -117,10 +117,7 @@ def open_node(
 ) -> Iterator[DriveNode]:
     """Open the bus and the node on it; without ``-n`` the only drive there is.
 
-    Parameters
-    ----------
-    within_s : float, optional
-        What all transfers may take together, of a command that only reads.
+    ``within_s``: what all transfers may take together, of a command that only reads.
     """
     from pmsmtool.drive.drive_node import DriveNode
 

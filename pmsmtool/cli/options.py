@@ -376,10 +376,7 @@ def overspeed_option(function: Function) -> Function:
 def options_named(fields: Mapping[str, str] | None = None) -> Iterator[None]:
     """Name the options a person typed, where a request refuses the fields they fill in (``eps = 2`` -> ``--eps 2``).
 
-    Parameters
-    ----------
-    fields : mapping of str to str, optional
-        Field to option, where they differ; else a field's option is the one that fills a parameter of its name.
+    ``fields``: field to option, where they differ; else a field's option is the one that fills a parameter of its name.
     """
     try:
         yield

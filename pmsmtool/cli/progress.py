@@ -41,10 +41,7 @@ BAR = 20
 class StageProgress:
     """Tells the stages on standard error; implements ``commissioning.commission.Progress``.
 
-    Parameters
-    ----------
-    out : Output
-        Where the lines go; quiet says nothing, ``-v`` every step.
+    ``out``: where the lines go; quiet says nothing, ``-v`` every step.
     """
 
     def __init__(self, out: Output) -> None:

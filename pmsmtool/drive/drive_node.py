@@ -440,10 +440,7 @@ class DriveNode:
 def vendor_product_serial(sdo: SdoChannel, drive_map: DriveMap | None = None) -> tuple[int, int, int]:
     """Read who a drive is; the serial number where its family keeps it, if 0x1018:04 is absent or 0.
 
-    Parameters
-    ----------
-    drive_map : DriveMap, optional
-        A map that may name the drive; otherwise the shipped one for its vendor and product is asked.
+    ``drive_map``: a map that may name the drive; otherwise the shipped one for its vendor and product is asked.
     """
     vendor, product, serial = (identity_number(sdo, sub) for sub in (1, 2, 4))
     known = None if serial else _map_of(drive_map, vendor, product)

@@ -188,10 +188,7 @@ def parse_vendor_tuning(
 ) -> VendorTuning | None:
     """Read the table; everything that is wrong goes to ``complain``.
 
-    Parameters
-    ----------
-    cells : mapping of str to Cell
-        Objects of the map, where what a step uses is written.
+    ``cells``: objects of the map, where what a step uses is written.
     """
     said: list[str] = []
 

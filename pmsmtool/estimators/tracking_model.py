@@ -143,10 +143,7 @@ def steady(parts: Sequence[Trace]) -> list[Trace]:
     What is steady is measured by the largest current and speed of all parts: a part alone may hold nothing but a
     transient, whose noise it would be taken for.
 
-    Parameters
-    ----------
-    parts : sequence of Trace
-        As :func:`windows` returns them, each without a gap.
+    ``parts``: as :func:`windows` returns them, each without a gap.
     """
     size = {name: np.concatenate([np.zeros(0), *(part[name] for part in parts)]) for name in SIGNALS}
     rise = {name: np.concatenate([np.zeros(0), *(np.abs(part[name]) for part in parts)]) for name in RISES}

@@ -108,10 +108,7 @@ class Plan:
     def lines(self, marks: Mapping[str, str] | None = None) -> list[str]:
         """Return the difference list a person consents to.
 
-        Parameters
-        ----------
-        marks : mapping of str to str, optional
-            What to say behind an entry, by its name.
+        ``marks``: what to say behind an entry, by its name.
         """
         rows = [_row(change, (marks or {}).get(change.name, "")) for change in self.changes]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

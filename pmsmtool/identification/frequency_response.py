@@ -140,10 +140,8 @@ def encoder_errors(parts: Sequence[Trace], torque: Torque, direction: int) -> di
 def small_signal_doubt(sigma_a: float, displaced_a: float, deviation_a: float) -> float:
     """Return what a small current's noise, and what a dead time displaces its samples by, may do to the torque's scale.
 
-    Parameters
-    ----------
-    sigma_a, displaced_a, deviation_a : float
-        Noise of a sample, displacement of the samples, and deviation of the current itself (A).
+    ``sigma_a``, ``displaced_a``, ``deviation_a``: noise of a sample, displacement of the samples, and deviation of the
+    current itself (A).
     """
     return math.hypot(NOISE_DOUBT * (sigma_a / deviation_a) ** 2, SAMPLE_DOUBT * displaced_a / deviation_a)
 

@@ -231,10 +231,7 @@ def judge_push(pushes: Trace) -> list[Finding]:
 def judge_pulses(pulses: Sequence[Trace]) -> list[Finding]:
     """Return what longer torque pulses show to be wrong: no current that was asked for, a position that falls.
 
-    Parameters
-    ----------
-    pulses : sequence of Trace
-        ``theta_M_rad``, ``i_q_a``, and in the conditions the ``i_command_a`` of each.
+    ``pulses``: ``theta_M_rad``, ``i_q_a``, and in the conditions the ``i_command_a`` of each.
     """
     known = [pulse for pulse in pulses if len(pulse) > LEAST_SAMPLES and pulse.meta.get("i_command_a")]
     if not known:
@@ -297,10 +294,7 @@ def _given(pulses: Sequence[Trace], commands: Sequence[float]) -> NDArray[np.flo
 def judge_sensors(vectors: Trace) -> Finding:
     """Judge whether the three phase currents of three vectors add up to the same, whatever the offsets are.
 
-    Parameters
-    ----------
-    vectors : Trace
-        As of ``phase_check.check_phases``.
+    ``vectors``: as of ``phase_check.check_phases``.
     """
     total = vectors["i_a_a"] + vectors["i_b_a"] + vectors["i_c_a"]
     share = float(np.ptp(total) / np.abs(np.mean(vectors["i_d_a"])))
@@ -347,10 +341,8 @@ def supply_power(at_rest: Trace, loaded: Trace) -> tuple[float, float]:
     The supply is taken for a voltage behind a resistance: the link falls with the current drawn from it. Infinite where
     it falls by less than :data:`SAGS` of :data:`SAGS`, which a meter's scatter may be, or was not recorded.
 
-    Parameters
-    ----------
-    at_rest, loaded : Trace
-        ``U_dc_v`` without a current, and under direct currents ``i_d_a`` (A peak) of the voltages ``u_d_v``.
+    ``at_rest``, ``loaded``: ``U_dc_v`` without a current, and under direct currents ``i_d_a`` (A peak) of the voltages
+    ``u_d_v``.
     """
     if "U_dc_v" not in at_rest.signals or "U_dc_v" not in loaded.signals:
         return math.inf, 0.0

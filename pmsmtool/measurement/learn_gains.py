@@ -177,10 +177,7 @@ def staircase(
 ) -> tuple[list[float], list[tuple[float, float]]]:
     """Return speeds (rad/s), one per tick, that rise from ``low`` by steps on a ramp, and when the ways up are (s).
 
-    Parameters
-    ----------
-    bandwidth : float
-        K_p / J of the loop (1/s).
+    ``bandwidth``: K_p / J of the loop (1/s).
     """
     tick = step * bandwidth * TICK_S
     speeds = [low] * round(REST_AT_LOW_S / TICK_S)

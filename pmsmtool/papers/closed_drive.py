@@ -109,10 +109,7 @@ class _Rig:
 class OpenDrive(_Rig):
     """The reference drive with a design of its own, on the same machine.
 
-    Parameters
-    ----------
-    source, values, seed
-        As of :class:`ClosedNode`; all values of the catalogue.
+    ``source``, ``values``, ``seed``: as of :class:`ClosedNode`; all values of the catalogue.
     """
 
     def __init__(self, source: MachineFile, values: Mapping[str, float], seed: int) -> None:

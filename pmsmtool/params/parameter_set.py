@@ -289,10 +289,7 @@ class Difference:
 def compare(old: ParameterSet, new: ParameterSet, *, common_only: bool = False) -> tuple[Difference, ...]:
     """List the entries in which ``new`` differs from ``old``.
 
-    Parameters
-    ----------
-    common_only : bool
-        Leave out what only one of the sets holds.
+    ``common_only``: leave out what only one of the sets holds.
     """
     found = []
     for row in EVERY:

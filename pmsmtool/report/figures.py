@@ -291,10 +291,7 @@ def band_figure(rows: Mapping[str, tuple[float, float, float, float]], unit: str
 def bands_figure(groups: Mapping[str, Mapping[str, tuple[float, float, float, float]]], caption: str) -> Figure:
     """As :func:`band_figure`, one pair of axes per unit.
 
-    Parameters
-    ----------
-    groups : mapping of str to mapping
-        Rows by unit.
+    ``groups``: rows by unit.
     """
     lines = sum(map(len, groups.values()))
     canvas, panels = _canvas(len(groups), 1, height=0.25 * len(groups) + 0.12 * lines)
@@ -327,10 +324,7 @@ FAR_OUT = 20.0
 def difference_figure(rows: Mapping[str, tuple[float, float]], caption: str) -> Figure:
     """Draw differences of two runs over the half widths of their 95 % intervals: inside -1 to 1 they agree.
 
-    Parameters
-    ----------
-    rows : mapping of str to (difference, interval)
-        In one unit each; the interval is not zero.
+    ``rows``: in one unit each; the interval is not zero.
     """
     shares = {name: difference / interval for name, (difference, interval) in rows.items()}
     canvas, (axes,) = _canvas(1, 1, height=0.3 + 0.12 * len(rows))
@@ -411,10 +405,7 @@ def proof_figure(
 def move_figure(moves: Mapping[str, Trace], caption: str) -> Figure:
     """Draw the following error of moves over the time since their demand began.
 
-    Parameters
-    ----------
-    moves : mapping of str to Trace
-        Recorded moves (``theta_ref_rad``, ``theta_m_rad``) by their names.
+    ``moves``: recorded moves (``theta_ref_rad``, ``theta_m_rad``) by their names.
     """
     canvas, (axes,) = _canvas(1, 1, height=0.7)
     for (name, trace), colour in zip(moves.items(), _colours(len(moves)), strict=True):

@@ -59,10 +59,7 @@ def designed_speed_loop(design: Design, current: SampledLoop) -> SampledLoop | N
 def lacking_gains(offers: Collection[str]) -> dict[str, tuple[str, ...]]:
     """Return by loop the gains that a drive has no object for.
 
-    Parameters
-    ----------
-    offers : collection of str
-        Catalogue names it has an object for; those of q serve both axes where d has none.
+    ``offers``: catalogue names it has an object for; those of q serve both axes where d has none.
     """
     served = {*offers, *(d for q, d in ONE_PAIR.items() if q in offers)}
     needs = {CURRENT_LOOPS: CURRENT_GAINS, SPEED_LOOP: SPEED_GAINS}
