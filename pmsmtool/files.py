@@ -28,7 +28,7 @@ _DEVICES = ("/dev/", "/proc/")
 
 
 def read_bytes(path: Path, *, largest: int = TEXT_BYTES, hint: str = "check the path") -> bytes:
-    """Return the bytes of a file.
+    """Return the bytes of a file. Raises ConfigError: missing, unreadable or too large.
 
     Parameters
     ----------
@@ -38,11 +38,6 @@ def read_bytes(path: Path, *, largest: int = TEXT_BYTES, hint: str = "check the 
         Bytes it may have; more are not read.
     hint : str
         Next step where there is no such file.
-
-    Raises
-    ------
-    ConfigError
-        Missing, unreadable or too large.
     """
     where = str(path)
     try:
@@ -111,6 +106,8 @@ def make_folder(path: Path, *, hint: str = "choose another folder") -> None:
 def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: str = "choose another folder") -> None:
     """Write a file in one step: a reader finds the old or the new one, never a part.
 
+    Raises ConfigError: it cannot be written; the old file, if there was one, is still there.
+
     Parameters
     ----------
     path : Path
@@ -121,11 +118,6 @@ def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: 
         Whether it must be on the disk on return, for what has to survive a power cut.
     hint : str
         Next step where it cannot be written.
-
-    Raises
-    ------
-    ConfigError
-        It cannot be written; the old file, if there was one, is still there.
     """
     data = content.encode() if isinstance(content, str) else content
     path = Path(path)

@@ -41,15 +41,12 @@ def page_module() -> bytes | None:
 def load(name: str) -> ctypes.CDLL:
     """Load a kernel, once per process.
 
+    Raises PmsmtoolError: the library is not there, or the system refuses to load it.
+
     Parameters
     ----------
     name : str
         ``pmsm_core``, ``pmsm_core_f64``, ``pmsm_sim`` or ``pmsm_design`` (``packaging/kernels.py``).
-
-    Raises
-    ------
-    PmsmtoolError
-        The library is not there, or the system refuses to load it.
     """
     path = LIBRARY_FOLDER / library_name(name)
     if not path.is_file():

@@ -74,6 +74,8 @@ def _whole_numbers(value: Any, name: str) -> Iterator[tuple[str, int]]:
 def toml_text(tables: Mapping[str, Any], *, comment: str = "") -> str:
     """Return the TOML document of nested tables.
 
+    Raises TypeError: a value TOML has no form for (``None`` among them: leave the key out).
+
     Parameters
     ----------
     tables : mapping
@@ -81,11 +83,6 @@ def toml_text(tables: Mapping[str, Any], *, comment: str = "") -> str:
         (an array of tables). A table's own values are written before its sub-tables.
     comment : str
         Written first, each line after ``# ``.
-
-    Raises
-    ------
-    TypeError
-        A value TOML has no form for (``None`` among them: leave the key out).
     """
     lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     if lines:

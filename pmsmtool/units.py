@@ -219,6 +219,9 @@ def unit_of_key(key: str) -> str:
 def parse_quantity(text: str, dimension: str) -> float:
     """Return the SI value of a quantity written with its unit.
 
+    Raises ConfigError: no number, no unit where one is due, a unit of another dimension, or a current that does not say
+    whether it is peak or rms.
+
     Parameters
     ----------
     text : str
@@ -226,12 +229,6 @@ def parse_quantity(text: str, dimension: str) -> float:
     dimension : str
         Name of a dimension (``"frequency"``; the result is in its SI unit) or a unit of the catalogue
         (``"rpm"``; the result is in that unit).
-
-    Raises
-    ------
-    ConfigError
-        No number, no unit where one is due, a unit of another dimension, or a current that does not say
-        whether it is peak or rms.
     """
     wanted = check_unit(DIMENSIONS.get(dimension, dimension))
     if wanted.dimension == "current":

@@ -262,17 +262,12 @@ def _stored_gains(
 def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDesign:
     """Return a design whose speed and position loops are those of its axis.
 
+    Raises ConfigError: the machine has no inertia; DesignInfeasible: no gains keep the margins over the tolerance box.
+
     Parameters
     ----------
     design : Design
         As ``tune`` makes it: its current loop is part of the path.
-
-    Raises
-    ------
-    ConfigError
-        The machine has no inertia.
-    DesignInfeasible
-        No gains keep the margins over the tolerance box.
     """
     source = design.machine
     shaft = mechanics_of(source)

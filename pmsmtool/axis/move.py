@@ -76,17 +76,12 @@ def shown(value: float, unit: str) -> str:
 
 
 def move_result(trace: Trace) -> MoveResult:
-    """Return what a move says.
+    """Return what a move says. Raises IdentificationError: too few samples, or the demand did not move.
 
     Parameters
     ----------
     trace : Trace
         As ``experiments.move.record_move`` leaves it.
-
-    Raises
-    ------
-    IdentificationError
-        Too few samples, or the demand did not move.
     """
     way = abs(float(trace.meta["way_rad"]))
     t, demand, error = trace.t_s, trace["theta_ref_rad"], trace["theta_ref_rad"] - trace["theta_m_rad"]

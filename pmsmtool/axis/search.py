@@ -178,7 +178,7 @@ def _notches(path: AxisPath, allowed: bool) -> Iterator[Notch]:
 
 
 def stiffest(box: Box, limits: Limits, *, notch: bool = True, loops: Sequence[Loop] = LOOPS) -> AxisGains:
-    """Return the gains with the largest K_i K_v that keep the limits over the box.
+    """Return the gains with the largest K_i K_v that keep the limits over the box. Raises DesignInfeasible: none does.
 
     Parameters
     ----------
@@ -186,11 +186,6 @@ def stiffest(box: Box, limits: Limits, *, notch: bool = True, loops: Sequence[Lo
         Whether the drive has a notch to set.
     loops : sequence of str
         Those that these gains decide; of ``speed`` alone K_v is not looked at.
-
-    Raises
-    ------
-    DesignInfeasible
-        None does.
     """
     path = box.path
     positions = POSITION_RATIOS if "position" in loops else POSITION_RATIOS[:1]

@@ -32,7 +32,7 @@ class LogFrame:
 
 
 class BusLog:
-    """The frames of a file.
+    """The frames of a file. Raises ConfigError: another suffix, or a file that cannot be opened.
 
     Parameters
     ----------
@@ -45,11 +45,6 @@ class BusLog:
         Lines that are no frame, known after :meth:`frames`.
     first_wrong : str
         Why the first of them is none.
-
-    Raises
-    ------
-    ConfigError
-        Another suffix, or a file that cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:

@@ -30,6 +30,8 @@ def when_ready(
 ) -> Done:
     """Do something, again as long as the drive is busy; return what it gives.
 
+    Raises DriveFault: any that does not pass, or did not in the time.
+
     Parameters
     ----------
     work : callable
@@ -40,11 +42,6 @@ def when_ready(
         Which faults pass.
     meanwhile : callable, optional
         Done after every such fault.
-
-    Raises
-    ------
-    DriveFault
-        Any that does not pass, or did not in the time.
     """
     clock = connection.clock
     until = clock.now() + within_s

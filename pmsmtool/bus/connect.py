@@ -186,17 +186,15 @@ def in_time(
 ) -> Result:
     """Return what the work returns, or raise what it raises; it runs in a thread of its own.
 
+    Raises TimeoutError: it has not ended by then; the thread is left to itself and does not keep the program from
+    ending.
+
     Parameters
     ----------
     limit_s : float
         Seconds that are waited for it.
     too_late : callable
         Takes a result that came after all.
-
-    Raises
-    ------
-    TimeoutError
-        It has not ended by then; the thread is left to itself and does not keep the program from ending.
     """
     done: list[Result] = []
     failed: list[BaseException] = []

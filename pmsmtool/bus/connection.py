@@ -160,17 +160,12 @@ class Connection:
     # ---- sending --------------------------------------------------------------------------------
 
     def send(self, cob_id: int, data: bytes, *, patience_s: float = SEND_PATIENCE_S) -> None:
-        """Send one frame.
+        """Send one frame. Raises BusError: the adapter is gone, or nobody on the bus acknowledges.
 
         Parameters
         ----------
         patience_s : float
             How long a full transmit queue is waited for; 0 inside an action of the clock.
-
-        Raises
-        ------
-        BusError
-            The adapter is gone, or nobody on the bus acknowledges.
         """
         # A fresh message each time: some adapters pad its data in place.
         message = can.Message(arbitration_id=cob_id, data=data, is_extended_id=False)

@@ -80,6 +80,8 @@ def ask_motion(
 ) -> Consent:
     """Show the motion envelope and return the consent to move.
 
+    Raises Declined: the person said no, nobody can be asked, or another drive answered than ``--serial`` names.
+
     Parameters
     ----------
     envelope : lines
@@ -92,11 +94,6 @@ def ask_motion(
         Serial number the drive reports.
     out : Output
         Where the lines go.
-
-    Raises
-    ------
-    Declined
-        The person said no, nobody can be asked, or another drive answered than ``--serial`` names.
     """
     return _ask("motion", "Move the machine within these limits?", tuple(envelope), options, simulated, serial, out)
 

@@ -86,6 +86,8 @@ def rehearsal_bus(
 ) -> BusOptions:
     """Return a simulated bus with a machine behind a maker's dictionary, in volatile memory.
 
+    Raises ConfigError: a bus is named, too, or both a file and a family.
+
     Parameters
     ----------
     eds : str or None
@@ -94,11 +96,6 @@ def rehearsal_bus(
         Shipped family whose map the drive shows, instead of a file.
     machine : Path, optional
         The machine; a profile without one.
-
-    Raises
-    ------
-    ConfigError
-        A bus is named, too, or both a file and a family.
     """
     if bus.interface is not None or bus.channel is not None:
         raise ConfigError(

@@ -213,15 +213,12 @@ def _tell_more(found: Capabilities, request: IdentifyRequest, out: Output) -> No
 def supply_reader(connection: Connection, node: int, *, simulated: bool) -> ReadSupply:
     """Return what reads the supply that feeds a drive: a person is asked while a current flows.
 
+    Raises Declined: nobody can be asked; nothing was moved.
+
     Parameters
     ----------
     simulated : bool
         The drive is simulated in this process, and its supply with it.
-
-    Raises
-    ------
-    Declined
-        Nobody can be asked; nothing was moved.
     """
     from pmsmtool.cli.consent import person_present
     from pmsmtool.errors import Declined

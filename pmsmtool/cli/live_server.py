@@ -109,7 +109,7 @@ class Samples:
 
 
 class LiveServer(socketserver.ThreadingTCPServer):
-    """Serves one page, and the samples to it.
+    """Serves one page, and the samples to it. Raises ConfigError: the port cannot be had.
 
     Parameters
     ----------
@@ -119,11 +119,6 @@ class LiveServer(socketserver.ThreadingTCPServer):
         The page; its scripts stand in it.
     head : mapping
         What the page is told first: ``title``, ``keep_s``, ``signals`` with ``name`` and ``unit``.
-
-    Raises
-    ------
-    ConfigError
-        The port cannot be had.
     """
 
     allow_reuse_address = os.name == "posix"  # Windows would let two servers share a port

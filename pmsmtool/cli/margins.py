@@ -223,6 +223,8 @@ def _table(spreads: Sequence[Spread] | Sequence[Observed], worst: str = "worst c
 def executor(scheduler: str, workers: int | None = None) -> Iterator[Any]:
     """Open an executor with ``map``, as ``concurrent.futures``.
 
+    Raises NotAvailable: the extra ``cluster`` is not installed; BusError: the cluster does not answer.
+
     Parameters
     ----------
     scheduler : str
@@ -230,13 +232,6 @@ def executor(scheduler: str, workers: int | None = None) -> Iterator[Any]:
         (``tcp://host:8786``).
     workers : int, optional
         Processes of the pool.
-
-    Raises
-    ------
-    NotAvailable
-        The extra ``cluster`` is not installed.
-    BusError
-        The cluster does not answer.
     """
     if scheduler == "local":
         yield None

@@ -49,6 +49,8 @@ NAMES = ("current", "speed")
 def why_no_limits(drive_map: DriveMap, bandwidth_hz: float | None, source: MachineFile | None = None) -> str:
     """Return why the limits of a drive cannot be designed; empty when they can.
 
+    Raises ConfigError: the bandwidth is no positive number.
+
     Parameters
     ----------
     drive_map : DriveMap
@@ -57,11 +59,6 @@ def why_no_limits(drive_map: DriveMap, bandwidth_hz: float | None, source: Machi
         Bandwidth of its current control, where it is known.
     source : MachineFile, optional
         The machine; None: not known yet, and not asked for.
-
-    Raises
-    ------
-    ConfigError
-        The bandwidth is no positive number.
     """
     try:
         drive = ClosedDrive(drive_map.name, frozenset(drive_map.cells), bandwidth_hz)

@@ -65,6 +65,8 @@ def dcf_file(
 ) -> bytes:
     """Return a device configuration file (CiA 306-1).
 
+    Raises ConfigError: values that do not fit, or objects the base does not describe.
+
     Parameters
     ----------
     wanted : ParameterSet
@@ -77,11 +79,6 @@ def dcf_file(
         Into the DeviceComissioning section when the base has none.
     where : str
         Name of the base for messages.
-
-    Raises
-    ------
-    ConfigError
-        Values that do not fit, or objects the base does not describe.
     """
     drive_map = drive_map or reference_map()
     if base is None:

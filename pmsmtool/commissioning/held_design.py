@@ -37,17 +37,14 @@ def held_by(drive_map: DriveMap, designed: Designed) -> Designed:
 def held_design(design: Design, drive_map: DriveMap) -> Design:
     """Return a design with the gains that a drive will hold, judged by the loops these make.
 
+    Raises ConfigError: values that do not fit the drive's types.
+
     Parameters
     ----------
     design : Design
         As designed, or as ``tune_closed`` says it for a closed drive.
     drive_map : DriveMap
         Of the drive; nothing changes for the reference drive, which holds every value as it is.
-
-    Raises
-    ------
-    ConfigError
-        Values that do not fit the drive's types.
     """
     if drive_map.staging:
         return design

@@ -195,6 +195,8 @@ def horizon(
 ) -> Horizon:
     """Find k_max by the global redundancy test.
 
+    Raises DesignInfeasible: the closed loop is not stable in Euler's prediction.
+
     Parameters
     ----------
     model : PredictionModel
@@ -209,11 +211,6 @@ def horizon(
         Only states inside; all states where none are given.
     cap : int
         Largest horizon looked at.
-
-    Raises
-    ------
-    DesignInfeasible
-        The closed loop is not stable in Euler's prediction.
     """
     if max(float(np.abs(poles).max()) for poles in model.closed_loop_poles()) >= 1.0:
         raise DesignInfeasible(

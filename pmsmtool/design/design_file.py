@@ -167,16 +167,13 @@ def load_design(path: str | Path) -> Design:
 def load_machine_or_design(source: str | Path | Design | MachineFile) -> tuple[MachineFile, Design | None]:
     """Return a machine, and its design where the source is one.
 
+    Raises ConfigError: there is no such thing, or what is wrong with it.
+
     Parameters
     ----------
     source : str, Path, Design or MachineFile
         File, told apart by its schema, run directory, of which the design comes first, or profile name; or what such a
         file holds.
-
-    Raises
-    ------
-    ConfigError
-        There is no such thing, or what is wrong with it.
     """
     if isinstance(source, Design):
         return source.machine, source

@@ -61,7 +61,7 @@ class FieldWeakeningDesign:
 
 
 def design_field_weakening(source: MachineFile, rated: Ratings, mode: str, margin: float) -> FieldWeakeningDesign:
-    """Choose the numbers of field weakening.
+    """Choose the numbers of field weakening. Raises ConfigError: unknown mode.
 
     Parameters
     ----------
@@ -71,11 +71,6 @@ def design_field_weakening(source: MachineFile, rated: Ratings, mode: str, margi
         A key of ``FIELD_WEAKENING_MODES``.
     margin : float
         Share of V_max kept for control.
-
-    Raises
-    ------
-    ConfigError
-        Unknown mode.
     """
     if mode not in FIELD_WEAKENING_MODES:
         raise ConfigError(

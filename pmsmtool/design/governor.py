@@ -108,7 +108,7 @@ def design_governor(
     predictor: bool,
     eps: float | None = None,
 ) -> GovernorDesign:
-    """Choose the governor's numbers.
+    """Choose the governor's numbers. Raises ConfigError: unknown mode.
 
     Parameters
     ----------
@@ -122,11 +122,6 @@ def design_governor(
         Whether the current controllers predict over the computation delay.
     eps : float, optional
         Tightening asked for; the least that covers the prediction error where none is given.
-
-    Raises
-    ------
-    ConfigError
-        Unknown mode.
     """
     if mode not in GOVERNOR_MODES:
         raise ConfigError(

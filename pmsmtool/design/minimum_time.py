@@ -73,6 +73,8 @@ def minimum_time(
 ) -> float:
     """Return the shortest time (s) from one current to another, or to a ball around it, by the support function.
 
+    Raises DesignInfeasible: the target cannot be reached within ``LONGEST_S``.
+
     Parameters
     ----------
     problem : TransferProblem
@@ -85,11 +87,6 @@ def minimum_time(
         Set of voltages.
     theta_e : float
         Rotor angle at the start (rad), for the hexagon.
-
-    Raises
-    ------
-    DesignInfeasible
-        The target cannot be reached within ``LONGEST_S``.
     """
     start, end = np.asarray(i_from, dtype=np.float64), np.asarray(i_to, dtype=np.float64)
     if float(np.hypot(*(end - start))) <= radius:

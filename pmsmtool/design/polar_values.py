@@ -90,6 +90,8 @@ def polar_values(
 ) -> tuple[dict[str, DesignValue], dict[str, Scalar], tuple[str, ...]]:
     """Return catalogue values, facts and notes of a polar law.
 
+    Raises DesignInfeasible: a law of the paper on a machine with L_d != L_q.
+
     Parameters
     ----------
     source, rated : MachineFile, Ratings
@@ -98,11 +100,6 @@ def polar_values(
         A key of :data:`polar_laws.LAWS`.
     weakening : str
         Mode of field weakening that was designed; other than ``lookup`` it is switched off.
-
-    Raises
-    ------
-    DesignInfeasible
-        A law of the paper on a machine with L_d != L_q.
     """
     T_s = source.inverter.T_s
     surface = SurfaceMachine.of(source.machine) if law in SURFACE_ONLY else _surface(source)

@@ -87,6 +87,9 @@ class Ratings:
 def ratings(source: MachineFile, V_limit_v: float, protection: Protection | None = None) -> Ratings:
     """Collect the ratings, at most the speed at which a fault can still be handled.
 
+    Raises ConfigError: no current rating at all; DesignInfeasible: as
+    :func:`~pmsmtool.machine.uncontrolled_generation.fault_reaction`.
+
     Parameters
     ----------
     source : MachineFile
@@ -95,13 +98,6 @@ def ratings(source: MachineFile, V_limit_v: float, protection: Protection | None
         Voltage in use (V peak), for the base speed.
     protection : str, optional
         What holds the DC link at over-speed, as asked for (``TuneRequest.overspeed_protection``).
-
-    Raises
-    ------
-    ConfigError
-        No current rating at all.
-    DesignInfeasible
-        As :func:`~pmsmtool.machine.uncontrolled_generation.fault_reaction`.
     """
     machine, limits = source.machine, source.limits
     if machine.I_nom_apk is None and machine.I_max_apk is None:

@@ -113,15 +113,13 @@ class _Late:
 def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
     """Show that the drive leaves operation when the heartbeat stops; it is disabled on return.
 
+    Raises SafetyRefusal: the drive has no supervision, ignores it, or reacts too late; or computer or answers are too
+    late to show it.
+
     Parameters
     ----------
     heartbeat : Heartbeat
         The tool's; it runs on return.
-
-    Raises
-    ------
-    SafetyRefusal
-        The drive has no supervision, ignores it, or reacts too late; or computer or answers are too late to show it.
     """
     node = drive.node
     if not (_set_consumer(drive) or _set_guarding(drive, heartbeat) or _set_process_data(drive, heartbeat)):

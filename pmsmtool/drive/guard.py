@@ -159,15 +159,12 @@ class GuardedDrive:
     def stop(self) -> bool:
         """Stop and confirm it; a Ctrl-C meanwhile removes the voltage at once.
 
+        Raises StopNotConfirmed: the drive does not confirm.
+
         Returns
         -------
         bool
             Whether there was a Ctrl-C meanwhile.
-
-        Raises
-        ------
-        StopNotConfirmed
-            The drive does not confirm.
         """
         interrupted = False
         while self._drive.may_be_energised:
@@ -186,15 +183,12 @@ class GuardedDrive:
     def restore(self) -> int:
         """Bring every changed object back to what it held, read it back, end the heartbeat.
 
+        Raises VerifyMismatch: an object does not hold its old content; each is named.
+
         Returns
         -------
         int
             Objects brought back.
-
-        Raises
-        ------
-        VerifyMismatch
-            An object does not hold its old content; each is named.
         """
         self._ended = True
         self._drive.stops_by_ramp = True

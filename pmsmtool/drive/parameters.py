@@ -173,17 +173,13 @@ class DriveParameters:
     def replace(self, new: Mapping[str, bytes], *, progress: Progress = _no_progress) -> None:
         """Write parameters and read all of them back; with staging they act together or not at all.
 
+        Raises DriveFault: the drive refused values, or the set; the message names each; VerifyMismatch: something reads
+        back differently.
+
         Parameters
         ----------
         new : mapping of str to bytes
             Contents by catalogue or table name.
-
-        Raises
-        ------
-        DriveFault
-            The drive refused values, or the set; the message names each.
-        VerifyMismatch
-            Something reads back differently.
         """
         if self.node.before_write is not None:
             for name, data in new.items():

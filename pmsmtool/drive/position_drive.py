@@ -44,6 +44,8 @@ WHOLE_WAY = 2.2
 class PositionDrive(TorqueDrive):
     """A drive that follows a position by its own loop, from where it stands.
 
+    Raises NotAvailable: the drive has no profile position mode, or shows neither its demand nor its following error.
+
     Attributes
     ----------
     error_limit_rad : float
@@ -55,11 +57,6 @@ class PositionDrive(TorqueDrive):
         The speed that the drive shows, against that of its position.
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
-
-    Raises
-    ------
-    NotAvailable
-        The drive has no profile position mode, or shows neither its demand nor its following error.
     """
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:

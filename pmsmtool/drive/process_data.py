@@ -89,15 +89,12 @@ def live_values(
 ) -> Iterator[LiveValues]:
     """Have the drive send live quantities every ``period_s``, as long as the context lasts.
 
+    Raises NotAvailable: more quantities than the borrowed PDOs hold, or a drive without them.
+
     Parameters
     ----------
     objects : mapping of str to DriveObject
         Where a drive shows what the names mean; default: the reference drive's.
-
-    Raises
-    ------
-    NotAvailable
-        More quantities than the borrowed PDOs hold, or a drive without them.
     """
     objects = {name: node.typed(objects[name]) for name in names}
     groups = _groups(names, objects)

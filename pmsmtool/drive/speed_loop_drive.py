@@ -82,6 +82,8 @@ class Oscillation:
 class SpeedLoopDrive(TorqueDrive):
     """A drive that follows a speed by its own loop; a record holds position and current at up to 1 kHz.
 
+    Raises NotAvailable: the drive has no velocity mode.
+
     Attributes
     ----------
     mode : int
@@ -92,11 +94,6 @@ class SpeedLoopDrive(TorqueDrive):
         Whether the current that is shown was taken as rms without a source: a share of 0x6075 is, too.
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
-
-    Raises
-    ------
-    NotAvailable
-        The drive has no velocity mode.
     """
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:

@@ -48,17 +48,14 @@ def quick_stop(node: DriveNode, *, ramp: bool = True, say: Callable[[str], None]
 
     A drive that answers has the time of its ramp; one that is silent for ``SILENCE_S`` ends the stop.
 
+    Raises StopNotConfirmed: the drive did not confirm; the machine may be energised.
+
     Parameters
     ----------
     ramp : bool
         Whether the drive may brake by its quick stop ramp; without it the voltage is removed and the shaft coasts.
     say : callable
         Told how the speed falls.
-
-    Raises
-    ------
-    StopNotConfirmed
-        The drive did not confirm; the machine may be energised.
     """
     failure: PmsmtoolError | None = None
     clock = node.connection.clock

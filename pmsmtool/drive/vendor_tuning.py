@@ -103,6 +103,9 @@ class VendorDrive(StandardDrive):
     def carry_out(self, step: VendorStep, wait: Wait, known: dict[str, float]) -> VendorAnswer:
         """Start a step, wait for its end, and read its results.
 
+        Raises DriveFault: the drive refuses, fails, or leaves operation; its error code is told with its meaning;
+        DriveTimeout: it does not end in its time.
+
         Parameters
         ----------
         step : VendorStep
@@ -111,13 +114,6 @@ class VendorDrive(StandardDrive):
             Lets time pass under the guard's eyes.
         known : dict of str to float
             Results so far, for what is counted relative to them.
-
-        Raises
-        ------
-        DriveFault
-            The drive refuses, fails, or leaves operation; its error code is told with its meaning.
-        DriveTimeout
-            It does not end in its time.
         """
         node = self.node
         began = node.connection.clock.now()

@@ -112,6 +112,8 @@ def value_text(data_type: int, data: bytes) -> str:
 def update_dcf(data: bytes, values: Mapping[Address, bytes], where: str = "DCF") -> bytes:
     """Return the file with new ``ParameterValue`` lines and every other byte kept.
 
+    Raises ConfigError: if the file does not describe one of the objects.
+
     Parameters
     ----------
     data : bytes
@@ -120,11 +122,6 @@ def update_dcf(data: bytes, values: Mapping[Address, bytes], where: str = "DCF")
         Encoded values.
     where : str
         Name for messages.
-
-    Raises
-    ------
-    ConfigError
-        If the file does not describe one of the objects.
     """
     sheet = parse_eds(data, where)
     _require(sheet, values, where)

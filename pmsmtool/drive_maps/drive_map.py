@@ -108,17 +108,12 @@ class Cell:
         return struct.calcsize("<" + LETTERS[self.wire])
 
     def encode(self, value: float, values: Mapping[str, float]) -> bytes:
-        """Return the bytes of an SI value.
+        """Return the bytes of an SI value. Raises ConfigError: the value does not fit the type, or the gain is missing.
 
         Parameters
         ----------
         values : mapping
             The set the value belongs to; asked for ``gain``.
-
-        Raises
-        ------
-        ConfigError
-            The value does not fit the type, or the gain is missing.
         """
         raw = self.counts(value, values)
         letter = LETTERS[self.wire]

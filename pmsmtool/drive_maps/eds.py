@@ -124,7 +124,7 @@ def parse_integer(text: str, node_id: int | None = None) -> int:
 
 
 def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Eds:
-    """Return the data sheet.
+    """Return the data sheet. Raises ConfigError: if the file has no object at all.
 
     Parameters
     ----------
@@ -134,11 +134,6 @@ def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Ed
         Name for messages.
     node_id : int, optional
         Value of ``$NODEID`` where the file does not state one.
-
-    Raises
-    ------
-    ConfigError
-        If the file has no object at all.
     """
     text, encoding = decode(data)
     warnings: list[str] = []

@@ -77,6 +77,8 @@ def with_measured(
 ) -> DriveMap:
     """Return a map of this drive with the measured rows, checked as a file would be.
 
+    Raises ConfigError: the result is no map.
+
     Parameters
     ----------
     vendor, product : int
@@ -85,11 +87,6 @@ def with_measured(
         On which drive, and how well.
     kind : str or None
         ``peak`` or ``rms`` where that was decided of currents whose kind no source says.
-
-    Raises
-    ------
-    ConfigError
-        The result is no map.
     """
     held = {*base.cells, *(row.name for row in rows)}
     usable = [row for row in rows if not row.gain or row.gain in held]

@@ -78,15 +78,12 @@ class EncoderResult:
 def check_encoder_counts(turned: Trace) -> None:
     """Refuse an encoder whose reading did not change while the vector turned.
 
+    Raises IdentificationError: ``E_ENCODER``.
+
     Parameters
     ----------
     turned : Trace
         Two rows, before and after: ``theta_imposed_rad`` (electrical), ``theta_M_rad`` (mechanical).
-
-    Raises
-    ------
-    IdentificationError
-        ``E_ENCODER``.
     """
     imposed, measured = (abs(float(np.ptp(turned[name]))) for name in ("theta_imposed_rad", "theta_M_rad"))
     least = COUNTS_SHARE * imposed / MAX_POLE_PAIRS
@@ -102,17 +99,15 @@ def check_encoder_counts(turned: Trace) -> None:
 def estimate_encoder(forward: Trace, backward: Trace, limit_rad: float = LINEARITY_LIMIT_RAD) -> EncoderResult:
     """Pole pairs, direction and offset.
 
+    Raises IdentificationError: ``E_POLE_PAIRS`` when the count is not an integer, ``E_ROTOR_MOVED`` when the rotor
+    slips, ``E_EXCITATION``.
+
     Parameters
     ----------
     forward, backward : Trace
         ``theta_imposed_rad`` (electrical, unwrapped) and ``theta_M_rad`` (mechanical, unwrapped).
     limit_rad : float
         Largest deviation of the rotor from the imposed angle (electrical).
-
-    Raises
-    ------
-    IdentificationError
-        ``E_POLE_PAIRS`` when the count is not an integer, ``E_ROTOR_MOVED`` when the rotor slips, ``E_EXCITATION``.
     """
     slopes = [_slope(trace) for trace in (forward, backward)]
     mean = 0.5 * (slopes[0] + slopes[1])

@@ -38,16 +38,13 @@ class Noise:
 def estimate_noise(trace: Trace) -> Noise:
     """Pooled standard deviation of both axis currents about a straight line.
 
+    Raises IdentificationError: ``E_EXCITATION`` for too few samples, ``E_SNR`` when the trace is constant: the
+    quantiser hides the noise, and averaging cannot resolve less than one step.
+
     Parameters
     ----------
     trace : Trace
         ``i_d_a`` and ``i_q_a`` at zero current in a fixed frame.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION`` for too few samples, ``E_SNR`` when the trace is constant: the quantiser hides the noise, and
-        averaging cannot resolve less than one step.
     """
     n = len(trace)
     if n < MINIMUM_SAMPLES:

@@ -76,7 +76,7 @@ class PushResult:
 def estimate_pushes(
     pushes: Sequence[Trace], *, period_s: float, pole_pairs: int, tolerance: SensorTolerance | None = None
 ) -> PushResult:
-    """Return the estimates.
+    """Return the estimates. Raises IdentificationError: ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_IDENTIFIABLE``.
 
     Parameters
     ----------
@@ -89,11 +89,6 @@ def estimate_pushes(
         Pole pairs.
     tolerance : SensorTolerance
         Declared sensor tolerances.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_IDENTIFIABLE``.
     """
     tolerance = tolerance or SensorTolerance()
     if len(pushes) < LEAST_PUSHES:

@@ -201,6 +201,9 @@ def estimate_resistance(
 ) -> ResistanceResult:
     """Loop resistance from DC levels.
 
+    Raises IdentificationError: ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``, ``E_THERMAL_DRIFT``,
+    ``E_NOT_IDENTIFIABLE``, ``E_MODEL_MISMATCH``.
+
     Parameters
     ----------
     levels : Trace
@@ -216,12 +219,6 @@ def estimate_resistance(
         Temperature coefficient and reference.
     plateau_v : float
         Error of one phase that the drive's dead time makes, U_dc t_d / T_s (V); 0: not known.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``, ``E_THERMAL_DRIFT``, ``E_NOT_IDENTIFIABLE``,
-        ``E_MODEL_MISMATCH``.
     """
     tolerance = tolerance or SensorTolerance()
     copper = copper or Copper()

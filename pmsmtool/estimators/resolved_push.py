@@ -151,6 +151,8 @@ class Resolved:
 def push_blocks(push: Trace, period_s: float, pole_pairs: int) -> Blocks:
     """Return the rows of a push.
 
+    Raises IdentificationError: ``E_EXCITATION``: too short; ``E_CLIPPED``: the voltage was limited in too much of it.
+
     Parameters
     ----------
     push : Trace
@@ -159,11 +161,6 @@ def push_blocks(push: Trace, period_s: float, pole_pairs: int) -> Blocks:
         Control period (s).
     pole_pairs : int
         Pole pairs.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: too short; ``E_CLIPPED``: the voltage was limited in too much of it.
     """
     blocks = len(push) // BLOCK
     if blocks < LEAST_BLOCKS:

@@ -197,6 +197,9 @@ def observation_noise(observations: Trace, known: Known) -> tuple[float, float]:
 def track(observations: Trace, known: Known, wanted: Sequence[str] = TRACKED) -> Track:
     """Follow R and psi through observations.
 
+    Raises IdentificationError: ``E_EXCITATION``, ``E_NOT_IDENTIFIABLE`` naming the pair, or ``E_MODEL_MISMATCH`` when
+    the innovations stay inconsistent.
+
     Parameters
     ----------
     observations : Trace
@@ -205,12 +208,6 @@ def track(observations: Trace, known: Known, wanted: Sequence[str] = TRACKED) ->
         What is known before.
     wanted : sequence of str
         Out of ``tracking_model.TRACKED``: what must be identifiable.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``, ``E_NOT_IDENTIFIABLE`` naming the pair, or ``E_MODEL_MISMATCH`` when the innovations stay
-        inconsistent.
     """
     noise = observation_noise(observations, known)
     given = inputs(observations, known)

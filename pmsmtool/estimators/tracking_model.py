@@ -104,6 +104,8 @@ class Known:
 def windows(trace: Trace, rows: int, period_s: float | None = None) -> Trace:
     """Return means and rises over all windows of ``rows``; :data:`LIMITED` tells in which something was limited.
 
+    Raises ValueError: the trace lacks a signal of :data:`SIGNALS`.
+
     Parameters
     ----------
     trace : Trace
@@ -112,11 +114,6 @@ def windows(trace: Trace, rows: int, period_s: float | None = None) -> Trace:
         Length of a window.
     period_s : float, optional
         Time from row to row; default: the trace's.
-
-    Raises
-    ------
-    ValueError
-        The trace lacks a signal of :data:`SIGNALS`.
     """
     missing = [name for name in SIGNALS if name not in trace.signals]
     if missing:

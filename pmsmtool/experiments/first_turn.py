@@ -116,6 +116,8 @@ def _row(drive: Drive, angle_rad: float, signals: tuple[str, ...], *, at_rest: b
 def push_forth_and_back(drive: Drive, i_a: float, speed_rad_s: float, *, link: bool = False) -> Trace:
     """Push with a torque current one way, brake it, and the other way; one row per push.
 
+    Raises IdentificationError: ``E_EXCITATION``: the shaft does not answer, and the current flows.
+
     Parameters
     ----------
     drive : Drive
@@ -131,11 +133,6 @@ def push_forth_and_back(drive: Drive, i_a: float, speed_rad_s: float, *, link: b
     -------
     Trace
         ``i_command_a``, ``i_q_a`` at the end of the push (A peak), ``way_rad`` until then, ``U_dc_v`` where shown.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: the shaft does not answer, and the current flows.
     """
     try:
         answer = acceleration_per_ampere(drive, i_a, _answered)

@@ -32,6 +32,9 @@ def record_move(
 ) -> tuple[Trace, MoveProfile | None]:  # fmt: skip
     """Move by an angle and back, each time waiting until the demand has arrived and ``settle_s`` longer; stop.
 
+    Raises DriveTimeout: the demand does not arrive; LimitExceeded: current, speed, travel or following error; the
+    voltage is off.
+
     Parameters
     ----------
     find : tuple of float, optional
@@ -44,13 +47,6 @@ def record_move(
         what these moves do not rest on, one line each.
     MoveProfile or None
         What was found.
-
-    Raises
-    ------
-    DriveTimeout
-        The demand does not arrive.
-    LimitExceeded
-        Current, speed, travel or following error; the voltage is off.
     """
     found = None
     seen = _try_direction(guard, drive, way_rad)

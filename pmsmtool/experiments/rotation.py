@@ -75,17 +75,14 @@ class RotationPlan:
 def dwell_within(dwell_s: float, omega_max_rad_s: float) -> float:
     """Return a time per step (s) at which the shaft keeps to a speed limit, however few pole pairs it has.
 
+    Raises IdentificationError: ``E_EXCITATION``: the limit is too low for a turn in reasonable time.
+
     Parameters
     ----------
     dwell_s : float
         Time per step where the limit allows it (s).
     omega_max_rad_s : float
         Largest mechanical speed (rad/s). The pole pairs are what is to be found: one is assumed.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: the limit is too low for a turn in reasonable time.
     """
     least_s = SWING * STEP_RAD / omega_max_rad_s
     if least_s > SLOWEST_STEP_S:

@@ -54,6 +54,8 @@ class ShaftAnswer:
 def acceleration_per_ampere(drive: Drive, i_test_a: float, answered: Callable[[float, float], bool]) -> ShaftAnswer:
     """Return acceleration and friction from two pushes of different currents.
 
+    Raises IdentificationError: ``E_EXCITATION``: the shaft does not answer.
+
     Parameters
     ----------
     drive : Drive
@@ -62,11 +64,6 @@ def acceleration_per_ampere(drive: Drive, i_test_a: float, answered: Callable[[f
         Largest torque current (A peak).
     answered : callable
         Whether an angle (rad) turned in a time (s) counts as an answer.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: the shaft does not answer.
     """
     current, seconds = FIRST_SHARE * i_test_a / GROWTH**BELOW, FIRST_S
     for _ in range(MOST_TRIES):

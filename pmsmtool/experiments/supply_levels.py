@@ -25,6 +25,8 @@ def hold_supply_levels(
 ) -> Trace:
     """Return the readings, one row per level; the drive is off on return.
 
+    Raises StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded: as the guard ends the experiment.
+
     Parameters
     ----------
     i_a : float
@@ -36,11 +38,6 @@ def hold_supply_levels(
     -------
     Trace
         ``i_command_a``, ``supply_v``, ``supply_i_a``.
-
-    Raises
-    ------
-    StopNotConfirmed, Interrupted, BusError, DriveFault, LimitExceeded
-        As the guard ends the experiment.
     """
     rows: list[dict[str, float]] = []
     times: list[float] = []

@@ -49,6 +49,8 @@ FLAGS = (
 def c_files(image: bytes, *, prefix: str = "pmsm", design_id: str = "", all_laws: bool = False) -> dict[str, str]:
     """Return file name -> text of the configuration and of the core.
 
+    Raises ConfigError: if the prefix is no C identifier, or the image is refused.
+
     Parameters
     ----------
     image : bytes
@@ -59,11 +61,6 @@ def c_files(image: bytes, *, prefix: str = "pmsm", design_id: str = "", all_laws
         Content hash of the design the set came from; printed, not interpreted.
     all_laws : bool
         Keep the laws that the set does not use: for sets that come later, or two motors on one core.
-
-    Raises
-    ------
-    ConfigError
-        If the prefix is no C identifier, or the image is refused.
     """
     _check_prefix(prefix)
     values, lut = unpack_image(image)

@@ -163,6 +163,9 @@ def _check_saturation(values: Mapping[str, float], nodes: bytes) -> None:
 def pack_image(values: Mapping[str, float], lut: bytes = b"") -> bytes:
     """Return the image of a complete set of values.
 
+    Raises ImageRefused: names missing or unknown, values out of range, look-up data that do not fit; all violations are
+    listed.
+
     Parameters
     ----------
     values : mapping of str to float
@@ -174,11 +177,6 @@ def pack_image(values: Mapping[str, float], lut: bytes = b"") -> bytes:
     -------
     bytes
         ``4 * (SCALAR_WORDS + lut_size_words(values))`` bytes, little endian.
-
-    Raises
-    ------
-    ImageRefused
-        Names missing or unknown, values out of range, look-up data that do not fit; all violations are listed.
     """
     _check_names(values)
     _check_ranges(values)

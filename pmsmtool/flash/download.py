@@ -214,17 +214,13 @@ class Download:
     def admit(self, *, store: bool = True) -> None:
         """Refuse what no consent would allow: a map that is not this drive's, a drive that may move; only reads.
 
+        Raises ConfigError, SafetyRefusal: as ``flash.map_gate.check_map`` and :func:`refuse_while_enabled`;
+        NotAvailable: the plan has no entry; or it is to be stored, and the drive has no command for it.
+
         Parameters
         ----------
         store : bool
             As of :meth:`run`.
-
-        Raises
-        ------
-        ConfigError, SafetyRefusal
-            As ``flash.map_gate.check_map`` and :func:`refuse_while_enabled`.
-        NotAvailable
-            The plan has no entry; or it is to be stored, and the drive has no command for it.
         """
         check_map(self.node.map, self.identity, self.folder)
         if not self.plan.entries:  # storing would keep what others left in it, for nothing

@@ -141,15 +141,12 @@ class Plan:
 def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, bytes]) -> Plan:
     """Return the plan that brings a drive from what it holds to a set.
 
+    Raises ConfigError: values out of bounds, or that do not fit the drive's types; all of them.
+
     Parameters
     ----------
     found : mapping of str to bytes
         What the drive holds now, for every name of :func:`names_to_read`.
-
-    Raises
-    ------
-    ConfigError
-        Values out of bounds, or that do not fit the drive's types; all of them.
     """
     violations = wanted.violations()
     if violations:

@@ -116,15 +116,12 @@ def old_marks(snapshot: Snapshot) -> dict[str, bytes]:
 def check_snapshot(drive_map: DriveMap, snapshot: Snapshot, identity: Identity, *, other_drive: bool = False) -> None:
     """Refuse a snapshot that is not of this drive.
 
+    Raises ConfigError: another product, another layout, objects the map does not know, or another serial number.
+
     Parameters
     ----------
     other_drive : bool
         Another serial number of the same product is wanted (a spare part).
-
-    Raises
-    ------
-    ConfigError
-        Another product, another layout, objects the map does not know, or another serial number.
     """
     theirs = snapshot.identity
     if (theirs.vendor, theirs.product) != (identity.vendor, identity.product):

@@ -78,6 +78,8 @@ def check_canary(record: RunRecord, *, same_set: bool, where: str) -> None:
 def check_drives(identities: Sequence[Identity], serials: Mapping[int, int], canary: Mapping[str, Any]) -> None:
     """Refuse drives that are not listed, or not of the canary's kind; all reasons at once.
 
+    Raises SafetyRefusal: with a line per drive and reason.
+
     Parameters
     ----------
     identities : sequence of Identity
@@ -86,11 +88,6 @@ def check_drives(identities: Sequence[Identity], serials: Mapping[int, int], can
         Node id -> serial number, as listed.
     canary : mapping
         The drive of the canary's run (``RunRecord.drive``).
-
-    Raises
-    ------
-    SafetyRefusal
-        With a line per drive and reason.
     """
     reasons = []
     for found in identities:

@@ -172,6 +172,8 @@ def pulse_result(
 ) -> PulseResult:
     """Estimate from traces.
 
+    Raises IdentificationError: a trap is seen; a single quantity that cannot be told is in ``missing``.
+
     Parameters
     ----------
     traces : mapping of str to Trace
@@ -188,11 +190,6 @@ def pulse_result(
         Reference temperature, and what is known of the winding's temperature coefficient.
     alpha_psi_per_k : float
         Temperature coefficient of the flux linkage (1/K).
-
-    Raises
-    ------
-    IdentificationError
-        A trap is seen; a single quantity that cannot be told is in ``missing``.
     """
     tolerance = tolerance or SensorTolerance()
     if tolerance.bridge_difference_v is not None:

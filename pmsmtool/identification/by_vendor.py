@@ -36,15 +36,12 @@ COARSE = 0.005
 def vendor_estimates(tuning: VendorTuning, answers: Mapping[str, VendorAnswer]) -> dict[str, Estimate]:
     """Return the results by the keys of a machine file; a lone inductance is :data:`PHASE_INDUCTANCE`.
 
+    Raises IdentificationError: a result is a number that no machine has.
+
     Parameters
     ----------
     answers : mapping of str to VendorAnswer
         By catalogue name of the result.
-
-    Raises
-    ------
-    IdentificationError
-        A result is a number that no machine has.
     """
     both = {"motor.L_d_h", "motor.L_q_h"} <= set(tuning.results)
     found = {}

@@ -35,6 +35,8 @@ LARGEST_THRESHOLD_V = 3.0
 def calibrated_tolerance(tolerance: SensorTolerance, texts: Sequence[str]) -> SensorTolerance:
     """Return the tolerances with scales measured by an instrument.
 
+    Raises ConfigError: not of that form, an unknown quantity, or values that are no calibration.
+
     Parameters
     ----------
     tolerance : SensorTolerance
@@ -43,11 +45,6 @@ def calibrated_tolerance(tolerance: SensorTolerance, texts: Sequence[str]) -> Se
         ``V_dc=SHOWN:TRUE:TOLERANCE`` or ``I=SHOWN:TRUE:TOLERANCE``, each with its unit, a current with its kind; the
         tolerance is the instrument's 95 % half width, a quantity or a percentage of TRUE. Or
         ``bridge=SWITCH:DIODE:TOLERANCE``: thresholds of the devices, and the 95 % half width of their difference.
-
-    Raises
-    ------
-    ConfigError
-        Not of that form, an unknown quantity, or values that are no calibration.
     """
     for text in texts:
         name, _, numbers = text.partition("=")

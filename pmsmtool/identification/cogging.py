@@ -116,17 +116,14 @@ def turn() -> Array:
 def cogging_of(traces: Mapping[str, Trace], result: Evaluation) -> Cogging | None:
     """Return the cogging torque; None where nothing says the inertia, and where coasting alone shows none.
 
+    Raises IdentificationError: ``E_EXCITATION``: the shaft did not turn once, in both directions.
+
     Parameters
     ----------
     traces : mapping of str to Trace
         ``slow_<k>`` of the run: ``i_d_a i_q_a theta_M_rad``.
     result : Evaluation
         With what mechanics, or the frequency response, says of the inertia.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: the shaft did not turn once, in both directions.
     """
     slow = [trace for name, trace in sorted(traces.items()) if name.startswith(SLOW_TRACE)]
     J = result.estimates().get("J_kgm2")
@@ -172,6 +169,8 @@ def coasting_torque(trace: Trace, torque: Torque) -> float:
 def torque_orders(t_s: Array, theta: Array, torque_nm: Array, J_kgm2: float, highest: int) -> Complex:
     """Return the torque over the angle by order, as phasors of exp(j order theta), shape (highest + 1,).
 
+    Raises IdentificationError: ``E_EXCITATION``.
+
     Parameters
     ----------
     t_s, theta, torque_nm : ndarray, shape (n,)
@@ -180,11 +179,6 @@ def torque_orders(t_s: Array, theta: Array, torque_nm: Array, J_kgm2: float, hig
         Inertia.
     highest : int
         Highest order.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``.
     """
     sense = 1.0 if theta[-1] > theta[0] else -1.0
     way = np.maximum.accumulate(sense * (theta - theta[0]))

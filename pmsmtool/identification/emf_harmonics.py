@@ -129,6 +129,8 @@ def harmonics_of(
 ) -> EmfHarmonics | None:
     """Return the harmonics; None without the run, or without what it is reduced by.
 
+    Raises IdentificationError: ``E_CLIPPED``; ``E_EXCITATION``: too few turns or speeds.
+
     Parameters
     ----------
     traces : mapping of str to Trace
@@ -141,11 +143,6 @@ def harmonics_of(
         Control period (s).
     modulation : Modulation or None
         What the ripple at the switching edges makes of the inverter's error; None: nothing.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_CLIPPED``; ``E_EXCITATION``: too few turns or speeds.
     """
     records = [traces[f"{TRACE}{k}"] for k in range(sum(name.startswith(TRACE) for name in traces))]
     resistance, found, flux = result.resistance, result.inductance, result.flux

@@ -197,6 +197,9 @@ def evaluate(
 ) -> Evaluation:
     """Estimate everything the traces allow; what is refused takes only what depends on it along.
 
+    Raises IdentificationError: noise, phases, encoder counts or current sensors: then no value can be trusted;
+    ConfigError: there is no zero-current trace.
+
     Parameters
     ----------
     traces : mapping of str to Trace
@@ -220,13 +223,6 @@ def evaluate(
         Experiments that were refused while they ran, by the keys of ``Evaluation.refused``: their traces are not whole.
     plateau_v : float
         As of ``estimators/resistance.py`` (V).
-
-    Raises
-    ------
-    IdentificationError
-        Noise, phases, encoder counts or current sensors: then no value can be trusted.
-    ConfigError
-        There is no zero-current trace.
     """
     if "zero_current" not in traces:
         raise ConfigError("the run has no zero-current trace", hint="run identify again")

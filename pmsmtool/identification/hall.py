@@ -93,16 +93,14 @@ class HallAlignment:
 def hall_alignment(trace: Trace) -> HallAlignment:
     """Return how three Hall sensors are wired and placed.
 
+    Raises IdentificationError: E_HALL: a wire does not change, the sensors are spaced by 60 degrees, or their errors
+    hide the order.
+
     Parameters
     ----------
     trace : Trace
         ``commanded_rad`` and ``angle_rad``: electrical angle of the current vector, a turn and more each way;
         ``hall_pattern``: bit k is wire k + 1.
-
-    Raises
-    ------
-    IdentificationError
-        E_HALL: a wire does not change, the sensors are spaced by 60 degrees, or their errors hide the order.
     """
     angle, pattern = trace["angle_rad"], np.asarray(trace["hall_pattern"], dtype=np.int64)
     for k in range(3):

@@ -41,6 +41,9 @@ small where the current changes within half a move, at +-13 %."""
 def move_mechanics(trace: Trace, *, pole_pairs: int, undecided: bool, rated_apk: float = 0.0) -> dict[str, Estimate]:
     """Return ``J_per_psi`` (kg m2/Wb) of recorded moves, and ``tau_c_per_psi`` (N m/Wb) where it is above zero.
 
+    Raises IdentificationError: too few moves, moves too short for the samples, or they do not tell inertia from
+    friction.
+
     Parameters
     ----------
     trace : Trace
@@ -51,11 +54,6 @@ def move_mechanics(trace: Trace, *, pole_pairs: int, undecided: bool, rated_apk:
         Whether no source says if the drive's amperes are peak or rms; they were read as rms.
     rated_apk : float
         Rated current of the drive (A peak), of which the offsets of its current sensors are a share.
-
-    Raises
-    ------
-    IdentificationError
-        Too few moves, moves too short for the samples, or they do not tell inertia from friction.
     """
     if trace.meta.get("speed_doubt"):
         raise IdentificationError(

@@ -74,6 +74,9 @@ class PhaseCheck:
 def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
     """Judge three vectors at 0, 120 and 240 degrees.
 
+    Raises IdentificationError: ``E_SNR``, ``E_NOT_CONNECTED``, ``E_PHASE_OPEN``, ``E_CURRENT_SENSOR``,
+    ``E_NOT_SETTLED``, ``E_UNBALANCED``.
+
     Parameters
     ----------
     vectors : Trace
@@ -81,11 +84,6 @@ def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
         ``moved`` 1 where the rotor did not come to rest; ``meta["i_command_a"]``.
     noise : Noise
         From the zero-current trace.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_SNR``, ``E_NOT_CONNECTED``, ``E_PHASE_OPEN``, ``E_CURRENT_SENSOR``, ``E_NOT_SETTLED``, ``E_UNBALANCED``.
     """
     phases = np.stack([vectors["i_a_a"], vectors["i_b_a"], vectors["i_c_a"]], axis=1)
     strongest = np.max(np.abs(phases), axis=0)
@@ -174,6 +172,8 @@ class PairCheck:
 def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
     """Judge the slopes of the three pairs of phases; while the rotor moves they say nothing, and are not judged.
 
+    Raises IdentificationError: ``E_CURRENT_SENSOR``, ``E_UNBALANCED``.
+
     Parameters
     ----------
     pairs : Trace
@@ -183,11 +183,6 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
         From the zero-current trace.
     curve : InverterCurve
         Voltage error from the DC levels.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_CURRENT_SENSOR``, ``E_UNBALANCED``.
     """
     mismatch = estimate_mismatch(pairs, noise)
     if mismatch.spread > SENSOR_LIMIT:

@@ -70,17 +70,15 @@ class PositionLag:
 def position_lag(trace: Trace, rad_per_count: float) -> PositionLag:
     """Return speed over lag of moves there and back.
 
+    Raises IdentificationError: the moves are not even for long enough, or the lag does not settle, or it is too small
+    to be seen.
+
     Parameters
     ----------
     trace : Trace
         As ``experiments.move.record_move`` leaves it.
     rad_per_count : float
         Angle of one count of the position (rad).
-
-    Raises
-    ------
-    IdentificationError
-        The moves are not even for long enough, or the lag does not settle, or it is too small to be seen.
     """
     t, demand, position = trace.t_s, trace["theta_ref_rad"], trace["theta_m_rad"]
     quarters = []

@@ -114,17 +114,12 @@ def predict(
 
 
 def check_prediction(values: Mapping[str, float]) -> None:
-    """Refuse a run whose intervals would be wider than an accepted value's.
+    """Refuse a run whose intervals would be wider than an accepted value's. Raises IdentificationError: ``E_SNR``.
 
     Parameters
     ----------
     values : mapping of str to float
         Relative standard deviations of what the run is to give.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_SNR``.
     """
     for key, value in values.items():
         if COVERAGE_FACTOR * value > LIMIT:

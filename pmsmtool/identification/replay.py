@@ -22,6 +22,9 @@ from pmsmtool.run_directory import RunDirectory, Stage
 def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibration: Sequence[str] = ()) -> Stage:
     """Recompute every estimate of a run from its traces, whatever its capability level.
 
+    Raises ConfigError: the run has no traces, or a file that the estimates depend on is gone or damaged;
+    IdentificationError: a trap is seen in the traces.
+
     Parameters
     ----------
     run : RunDirectory
@@ -31,13 +34,6 @@ def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibrat
         Replaces the sensor tolerances that the run was made with.
     calibration : sequence of str
         Scales against an instrument (``identification/calibration.py``).
-
-    Raises
-    ------
-    ConfigError
-        The run has no traces, or a file that the estimates depend on is gone or damaged.
-    IdentificationError
-        A trap is seen in the traces.
     """
     if (run.path / ANSWERS).is_file():
         raise ConfigError(

@@ -245,6 +245,8 @@ def fit_speed_loop(
 ) -> SpeedLoop:
     """Return the speed loop that answers as the record does.
 
+    Raises IdentificationError: too few samples, or no loop of this kind answers so.
+
     Parameters
     ----------
     first : SpeedLoop, optional
@@ -253,11 +255,6 @@ def fit_speed_loop(
         The loop's lag where another record of the drive told it: a gain does not change it.
     forward : bool
         Whether it lies between the loop and the torque (a slow current loop), not in the speed that is fed back.
-
-    Raises
-    ------
-    IdentificationError
-        Too few samples, or no loop of this kind answers so.
     """
     model = _Model(record, emf, lag_s, forward)
     firsts = [model.start(a) for a in FIRST_BANDWIDTHS]

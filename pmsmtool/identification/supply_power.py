@@ -34,18 +34,15 @@ ONE_VECTOR = "along one current vector: by how much the phases differ is not in 
 def resistance_by_supply(levels: Trace, *, tolerance: SensorTolerance | None = None) -> Estimate:
     """Return the loop resistance per phase (ohm) at the temperature of the run.
 
+    Raises IdentificationError: ``E_EXCITATION``: too few readings; ``E_NOT_CONNECTED``: no power comes with the
+    current; ``E_SNR``: the readings do not tell the copper loss.
+
     Parameters
     ----------
     levels : Trace
         ``i_command_a`` (A peak), ``supply_v``, ``supply_i_a``, one row per reading; some currents more than once.
     tolerance : SensorTolerance, optional
         That of the current gain counts twice: the copper loss goes with its square.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: too few readings; ``E_NOT_CONNECTED``: no power comes with the current; ``E_SNR``: the
-        readings do not tell the copper loss.
     """
     i = np.asarray(levels["i_command_a"], dtype=np.float64)
     power = np.asarray(levels["supply_v"] * levels["supply_i_a"], dtype=np.float64)

@@ -192,7 +192,7 @@ def _kind(written: str | None, text: str) -> CommutatedKind:
 
 
 def parse_emf_constant(text: str, between: Between | None) -> EmfConstant:
-    """Read a back-EMF constant.
+    """Read a back-EMF constant. Raises ConfigError: not readable, or it is not said what the voltage is.
 
     Parameters
     ----------
@@ -201,11 +201,6 @@ def parse_emf_constant(text: str, between: Between | None) -> EmfConstant:
         linkage ``0.41Wb``.
     between : {"line-line", "phase"} or None
         Where the voltage is measured; needed for all but a flux linkage and block commutation (the terminals).
-
-    Raises
-    ------
-    ConfigError
-        Not readable, or it is not said what the voltage is.
     """
     plain = re.sub(r"(?<=[A-Za-z0-9/)])\s+(?=[A-Za-z0-9/(])", "", text).replace("*", "").replace("²", "2")
     if flux := _FLUX.fullmatch(plain):
@@ -260,16 +255,13 @@ def torque_constant_by_emf(
 ) -> tuple[TorqueConstant, str]:
     """Read a torque constant whose ampere is not said, as the kind that the back-EMF constant makes it.
 
+    Raises ConfigError: no kind fits.
+
     Returns
     -------
     TorqueConstant
     str
         What was recognised; empty where the text itself says the kind.
-
-    Raises
-    ------
-    ConfigError
-        No kind fits.
     """
     value, written = _torque_number(text)
     if written is not None:

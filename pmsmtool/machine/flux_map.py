@@ -70,6 +70,8 @@ CHECK_POINTS = 3
 class FluxMap:
     """Flux linkages over a grid of currents (amplitude-invariant, rotor frame, d axis along the magnets).
 
+    Raises ConfigError: shapes that do not fit, an axis that does not increase, too few nodes, or holes.
+
     Attributes
     ----------
     i_d_a, i_q_a : ndarray, shape (n_d,), (n_q,)
@@ -82,11 +84,6 @@ class FluxMap:
         Nodes of the inverse table along psi_d and psi_q.
     meta : mapping
         JSON-serialisable facts: origin, what was repaired.
-
-    Raises
-    ------
-    ConfigError
-        Shapes that do not fit, an axis that does not increase, too few nodes, or holes.
     """
 
     i_d_a: Array

@@ -64,17 +64,15 @@ class RawFluxMap:
 def load_flux_map(path: Path, *, fill: bool = False) -> FluxMap:
     """Read a flux map.
 
+    Raises ConfigError: the file is missing, truncated, not numeric, not a grid, has an axis that does not increase, or
+    holes.
+
     Parameters
     ----------
     path : Path
         ``.npz``, ``.mat`` or ``.csv``.
     fill : bool
         Fill holes (``fill_holes``) instead of refusing them; what was filled is in ``meta["repairs"]``.
-
-    Raises
-    ------
-    ConfigError
-        The file is missing, truncated, not numeric, not a grid, has an axis that does not increase, or holes.
     """
     raw = read_flux_map(path)
     meta = dict(raw.meta)

@@ -123,7 +123,7 @@ def load_machine_file(source: str | Path) -> MachineFile:
 
 @next_step(NEXT_STEP)
 def parse_machine(text: str, *, where: str = "machine file", folder: Path | None = None) -> MachineFile:
-    """Parse the text of a machine file.
+    """Parse the text of a machine file. Raises ConfigError: not TOML, another schema, or a list of all violations.
 
     Parameters
     ----------
@@ -133,11 +133,6 @@ def parse_machine(text: str, *, where: str = "machine file", folder: Path | None
         Named in errors.
     folder : Path or None
         Where relative file names start; None refuses files beside the text.
-
-    Raises
-    ------
-    ConfigError
-        Not TOML, another schema, or a list of all violations.
     """
     tables = parse_toml(text, where=where)
     schema = tables.pop("schema", None)
@@ -156,7 +151,7 @@ def machine_from_tables(
     lines: Mapping[tuple[str, ...], int] | None = None,
     path: tuple[str, ...] = (),
 ) -> MachineFile:
-    """Build a machine from tables as in a machine file, without its schema.
+    """Build a machine from tables as in a machine file, without its schema. Raises ConfigError: with all violations.
 
     Parameters
     ----------
@@ -168,11 +163,6 @@ def machine_from_tables(
         Line of each key (``toml_text.toml_lines``).
     path : tuple of str
         Tables these tables stand in, for a file that embeds a machine.
-
-    Raises
-    ------
-    ConfigError
-        With all violations.
     """
     reader = MachineReader(tables, where, dict(lines or {}), path)
     parts = reader.read(folder)

@@ -86,6 +86,9 @@ def fault_reaction(
 ) -> FaultReaction:
     """Choose between gates off and, above the speed of uncontrolled generation, a short circuit.
 
+    Raises DesignInfeasible: a short circuit is asked for that demagnetises the machine; or nothing protects the link at
+    a fault at the machine's rated speed.
+
     Parameters
     ----------
     machine : MachineParameters
@@ -98,12 +101,6 @@ def fault_reaction(
         Most negative i_d that the magnet stands (A).
     protection : str, optional
         What a person states or asks for; None: a short circuit where the magnet stands it, else no speed beyond.
-
-    Raises
-    ------
-    DesignInfeasible
-        A short circuit is asked for that demagnetises the machine; or nothing protects the link at a fault at the
-        machine's rated speed.
     """
     any_rpm = math.inf
     from_rpm = generation_rpm(machine, U_dc_max_v)

@@ -52,17 +52,14 @@ def unused_current(i_max_apk: float, nameplate: MachineFile, *, pulses: bool) ->
 def require_speed(omega_max_rad_s: float, n_max_rpm: float) -> None:
     """Refuse a speed limit within which nothing can be told of a turning shaft.
 
+    Raises IdentificationError: ``E_EXCITATION``: the limit is below its share of the largest speed.
+
     Parameters
     ----------
     omega_max_rad_s : float
         Largest mechanical speed of the envelope (rad/s).
     n_max_rpm : float
         Largest speed of machine and drive (rpm).
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: the limit is below its share of the largest speed.
     """
     least, given = LEAST_SPEED_SHARE * n_max_rpm, rpm_from_rad_s(omega_max_rad_s)
     if given < least:
@@ -78,7 +75,7 @@ def require_speed(omega_max_rad_s: float, n_max_rpm: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What the experiments may use.
+    """What the experiments may use. Raises ConfigError: one of them leaves nothing.
 
     Attributes
     ----------
@@ -94,11 +91,6 @@ class Limits:
         Largest d current in the frame of the rotor (A peak).
     supply_w : float
         Largest power that the supply of the DC link is asked for (W).
-
-    Raises
-    ------
-    ConfigError
-        One of them leaves nothing.
     """
 
     I_nom_apk: float

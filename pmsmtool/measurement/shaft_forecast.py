@@ -116,6 +116,8 @@ def forecast_of(
 ) -> ShaftForecast:
     """Return what is known before the shaft is moved for its mechanics.
 
+    Raises IdentificationError: the traces say nothing of flux linkage or encoder; the run itself may still.
+
     Parameters
     ----------
     drive : Drive
@@ -124,11 +126,6 @@ def forecast_of(
         ``push_0``, ``push_1``, ``speeds`` and the shots of the inductances.
     noise, resistance, encoder, tolerance :
         What the experiments before say, and what is declared.
-
-    Raises
-    ------
-    IdentificationError
-        The traces say nothing of flux linkage or encoder; the run itself may still.
     """
     pole_pairs = round(encoder.pole_pairs.value)
     J, psi, L_q = (drive.read(f"motor.{name}") for name in ("J_kgm2", "psi_f_wb", "L_q_h"))

@@ -131,7 +131,7 @@ def compile_library(
     platform: str = sys.platform,
     strict: bool = False,
 ) -> None:
-    """Compile one kernel.
+    """Compile one kernel. Raises CompilerError: the compiler refused; carries its messages.
 
     Parameters
     ----------
@@ -147,11 +147,6 @@ def compile_library(
         Platform of the target, as ``sys.platform``.
     strict : bool
         Treat warnings as errors.
-
-    Raises
-    ------
-    CompilerError
-        The compiler refused; carries its messages.
     """
     with tempfile.TemporaryDirectory(dir=library.parent, prefix=".build-") as scratch:
         # A scratch folder of its own: linkers for Windows leave import libraries and debug files beside the output.

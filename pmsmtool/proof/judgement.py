@@ -95,7 +95,7 @@ def with_ripple(prediction: Prediction, traces: Mapping[str, Trace]) -> Predicti
 
 
 def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> Judgement:
-    """Compare measured responses with the prediction.
+    """Compare measured responses with the prediction. Raises ConfigError: a response has another length than predicted.
 
     Parameters
     ----------
@@ -103,11 +103,6 @@ def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> 
         As committed.
     measured : mapping
         Response by (experiment, signal); experiments that were not run any more are left out.
-
-    Raises
-    ------
-    ConfigError
-        A response has another length than predicted.
     """
     seen = []
     for (experiment, signal), band in prediction.bands.items():

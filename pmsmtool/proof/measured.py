@@ -74,6 +74,8 @@ def run_experiments(
 ) -> None:
     """Run the experiments in their order; the drive is guarded and off on entry.
 
+    Raises SpeedNotReached: the machine does not do what the next experiment begins with.
+
     Parameters
     ----------
     drive : Drive
@@ -86,11 +88,6 @@ def run_experiments(
         Takes each record; the rest is not run when it returns False.
     say : callable
         Told one line per experiment.
-
-    Raises
-    ------
-    SpeedNotReached
-        The machine does not do what the next experiment begins with.
     """
     drive.enable()
     drive.command_current(0.0, 0.0)  # the frame follows the rotor; what a later current step starts from

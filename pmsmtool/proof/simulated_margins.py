@@ -187,6 +187,8 @@ def simulated_margins(
 ) -> SimulatedMargins:
     """Simulate a design's drive on machines of its tolerance box.
 
+    Raises ConfigError: the scenario does not fit the drive.
+
     Parameters
     ----------
     design : Design
@@ -206,11 +208,6 @@ def simulated_margins(
         one call of the kernel over ``threads`` cores of this process (all of them by default).
     progress : callable, optional
         Told the drives done and wanted.
-
-    Raises
-    ------
-    ConfigError
-        The scenario does not fit the drive.
     """
     request = MarginRequest() if request is None else request
     scenario = torque_reversals(design) if scenario is None else scenario

@@ -242,6 +242,9 @@ def build_line(
 ) -> Line:
     """Return a line with the drives of a channel.
 
+    Raises ConfigError: the machine file, the faults file or the memory cannot be used, or there are not so many node
+    ids.
+
     Parameters
     ----------
     channel : Channel
@@ -252,11 +255,6 @@ def build_line(
         Frames take no time while there is no bit rate.
     make_core : callable
         Makes the application with its machine: ``(machine file, seed)``.
-
-    Raises
-    ------
-    ConfigError
-        The machine file, the faults file or the memory cannot be used, or there are not so many node ids.
     """
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.sim.simulated_machine import with_simulation
@@ -290,6 +288,8 @@ def build_line(
 def erase_memory(channel: str | None) -> list[Path]:
     """Erase the memory files of the simulated drives of a channel, unless the channel names its own (``nv=``).
 
+    Raises ConfigError: the channel cannot be used, or a file cannot be erased.
+
     Parameters
     ----------
     channel : str or None
@@ -299,11 +299,6 @@ def erase_memory(channel: str | None) -> list[Path]:
     -------
     list of Path
         What was erased.
-
-    Raises
-    ------
-    ConfigError
-        The channel cannot be used, or a file cannot be erased.
     """
     wanted = parse_channel(channel)
     if wanted.nv is not None:

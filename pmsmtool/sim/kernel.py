@@ -174,6 +174,8 @@ def library() -> Any:
 class Simulation:
     """One simulated drive with its machine: the C structs, and what they point to.
 
+    Raises ConfigError: the drive refuses the image.
+
     Parameters
     ----------
     setup : Setup
@@ -182,11 +184,6 @@ class Simulation:
         Parameter image of the drive (``firmware.image.pack_image``).
     keep : object
         Whatever the setup points to (a flux map's struct), kept alive with the simulation.
-
-    Raises
-    ------
-    ConfigError
-        The drive refuses the image.
     """
 
     def __init__(self, setup: Setup, image: bytes, keep: object = None) -> None:

@@ -126,7 +126,7 @@ def simulate_many(
     threads: int | None = None,
     signals: Sequence[int] = (),
 ) -> DriveRuns:
-    """Run a scenario on many drives, in one call of the kernel.
+    """Run a scenario on many drives, in one call of the kernel. Raises ConfigError: what cannot be simulated together.
 
     Parameters
     ----------
@@ -138,11 +138,6 @@ def simulate_many(
         Threads; one per core when not given. The result does not depend on it.
     signals : sequence of int
         Signals (``signals.Signal``, ``signals.Truth``) recorded of every drive, every ``scenario.decimation`` periods.
-
-    Raises
-    ------
-    ConfigError
-        What cannot be simulated together.
     """
     lib = _library()
     machine_file, model, periods = open_simulation(machine_file, params, scenario, None)

@@ -49,6 +49,9 @@ def operate(line: Line, machine_file: MachineFile, say: Say = lambda text: None)
 class Operation:
     """Runs one drive until it is stopped.
 
+    Raises ConfigError: the drive has another face, or the machine cannot be run; DesignInfeasible: there is no design
+    for it.
+
     Parameters
     ----------
     node : Node
@@ -62,13 +65,6 @@ class Operation:
     ----------
     ran : bool
         Whether it has been in operation.
-
-    Raises
-    ------
-    ConfigError
-        The drive has another face, or the machine cannot be run.
-    DesignInfeasible
-        There is no design for it.
     """
 
     def __init__(self, node: Node, machine_file: MachineFile, say: Say = lambda text: None) -> None:

@@ -138,7 +138,7 @@ class Client:
 
 
 class SocketcandServer:
-    """Serves one line.
+    """Serves one line. Raises BusError: the address is in use or does not exist.
 
     Parameters
     ----------
@@ -152,11 +152,6 @@ class SocketcandServer:
         Whether every frame reaches the programs as an error frame: a terminating resistor is missing.
     say : callable
         Told one line when the drives' time stood still for ``WORTH_SAYING_S`` or more.
-
-    Raises
-    ------
-    BusError
-        The address is in use or does not exist.
     """
 
     def __init__(

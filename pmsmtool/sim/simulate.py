@@ -48,19 +48,14 @@ def find_drive(source: str | Path | Design | MachineFile, params: Path | None = 
 
     A machine without a design is given the parameters that ``tune`` makes for it.
 
+    Raises ConfigError: there is no such thing, or what is wrong with it; DesignInfeasible: no design for this machine.
+
     Parameters
     ----------
     source : str, Path, Design or MachineFile
         File, folder or profile name, or what such a file holds.
     params : Path, optional
         A parameter set that is laid over the others.
-
-    Raises
-    ------
-    ConfigError
-        There is no such thing, or what is wrong with it.
-    DesignInfeasible
-        No design for this machine.
     """
     from pmsmtool.design.design_file import load_machine_or_design
 
@@ -98,7 +93,7 @@ def run_scenario(
     duration_s: float | None = None,
     simulation: Mapping[str, Value] | None = None,
 ) -> Trace:
-    """Simulate a scenario on a drive.
+    """Simulate a scenario on a drive. Raises ConfigError: what cannot be simulated together.
 
     Parameters
     ----------
@@ -110,11 +105,6 @@ def run_scenario(
         Another duration than the scenario's (s).
     simulation : mapping, optional
         ``[simulation]`` keys that differ from the machine file's and the scenario's.
-
-    Raises
-    ------
-    ConfigError
-        What cannot be simulated together.
     """
     if duration_s is not None:
         scenario = replace(scenario, duration_s=duration_s)

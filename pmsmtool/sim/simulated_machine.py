@@ -140,6 +140,8 @@ def build_setup(
 ) -> tuple[Setup, object]:
     """Return the kernel's setup and the object that keeps its flux map alive.
 
+    Raises ConfigError: what cannot be simulated, all of it.
+
     Parameters
     ----------
     machine_file : MachineFile
@@ -150,11 +152,6 @@ def build_setup(
         Whole drive, or the control core alone.
     start_rad_s : float
         Mechanical speed at the start (rad/s); a driven rotor without a schedule keeps it.
-
-    Raises
-    ------
-    ConfigError
-        What cannot be simulated, all of it.
     """
     settings = settings_of(machine_file)
     violations: list[str] = []

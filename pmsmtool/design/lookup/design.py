@@ -153,6 +153,8 @@ def design_table(
 ) -> LookupDesign:
     """Make the table.
 
+    Raises DesignInfeasible: the bounds cannot be kept in the drive's memory, or no speed can be reached.
+
     Parameters
     ----------
     source : MachineFile
@@ -165,11 +167,6 @@ def design_table(
         Share of V_max kept for control.
     loss_map : FluxMap, optional
         Iron loss (``OperatingMachine.loss_map``).
-
-    Raises
-    ------
-    DesignInfeasible
-        The bounds cannot be kept in the drive's memory, or no speed can be reached.
     """
     known = loss_map if request.axis == "speed" else None
     machine = at_temperature(

@@ -134,17 +134,14 @@ def lut_words(table: LookupTable, stored: StoredFormat) -> bytes:
 def table_parameters(arrays: Mapping[str, NDArray[Any]], where: str) -> ParameterSet:
     """Return what ``lut.npz`` gives a drive: the ``lut.*`` values, the axes and both tables.
 
+    Raises ConfigError: it is no table, or its words are not those its ``meta`` has the CRC-32 of.
+
     Parameters
     ----------
     arrays : mapping of str to ndarray
         Content of the file.
     where : str
         Its name, for messages.
-
-    Raises
-    ------
-    ConfigError
-        It is no table, or its words are not those its ``meta`` has the CRC-32 of.
     """
     hint = "give lut.npz as `lut` writes it"
     try:

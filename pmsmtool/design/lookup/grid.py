@@ -186,6 +186,8 @@ def refined_table(
 ) -> tuple[LookupTable, InterpolationError]:
     """Refine the axes until the stored table keeps its bounds.
 
+    Raises DesignInfeasible: the drive's memory is full before the bounds hold; the message names what was reached.
+
     Parameters
     ----------
     solve : callable
@@ -194,11 +196,6 @@ def refined_table(
         First axes; their nodes are kept. A single voltage stays single.
     bounds : GridBounds
         What is asked.
-
-    Raises
-    ------
-    DesignInfeasible
-        The drive's memory is full before the bounds hold; the message names what was reached.
     """
     x, y, z = stored_axes(*(np.asarray(axis, dtype=np.float64) for axis in (torque_nm, y, U_dc_v)))
     axes: Axes = (x, y, z)

@@ -175,6 +175,9 @@ def speed_table(
 ) -> LookupTable:
     """Solve a table over torque, speed and voltage.
 
+    Raises DesignInfeasible: a folded flux map, or limits that leave out zero current; ConfigError: references outside
+    the iron-loss map.
+
     Parameters
     ----------
     machine : OperatingMachine
@@ -189,13 +192,6 @@ def speed_table(
         Most negative i_d (A).
     U_dc_v : array_like, optional
         DC-link voltages (V) the limits belong to; sqrt(3) V_max where not given.
-
-    Raises
-    ------
-    DesignInfeasible
-        A folded flux map, or limits that leave out zero current.
-    ConfigError
-        References outside the iron-loss map.
     """
     V_max = np.atleast_1d(np.asarray(V_max_v, dtype=np.float64))
     U_dc = math.sqrt(3.0) * V_max if U_dc_v is None else np.atleast_1d(np.asarray(U_dc_v, dtype=np.float64))

@@ -24,15 +24,12 @@ COMMANDED: Mapping[str, type[CommandedRecorder]] = {
 def recorder_of(node: DriveNode, period_s: float) -> Recorder:
     """Return the recorder of a drive.
 
+    Raises NotAvailable: it has none that this program reads, or its map does not state enough of it.
+
     Parameters
     ----------
     period_s : float
         Control period, for the reference drive's recorder (s).
-
-    Raises
-    ------
-    NotAvailable
-        It has none that this program reads, or its map does not state enough of it.
     """
     if node.map.staging:
         return Recorder(node, period_s)

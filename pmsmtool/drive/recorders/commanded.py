@@ -29,10 +29,7 @@ _Row = TypeVar("_Row")
 class CommandedRecorder(Recorder):
     """A recorder that a drive's map describes.
 
-    Raises
-    ------
-    NotAvailable
-        The drive has no such recorder, or the map does not state enough of it.
+    Raises NotAvailable: the drive has no such recorder, or the map does not state enough of it.
 
     Attributes
     ----------

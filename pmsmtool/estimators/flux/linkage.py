@@ -139,6 +139,8 @@ def estimate_flux_linkage(
 ) -> FluxResult:
     """PM flux linkage from the means of windows at steady currents.
 
+    Raises IdentificationError: ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``, ``E_NOT_IDENTIFIABLE``.
+
     Parameters
     ----------
     speeds : Trace
@@ -163,11 +165,6 @@ def estimate_flux_linkage(
         Declared sensor tolerances.
     T_ref_c, alpha_psi_per_k : float
         Reference temperature (degC) and coefficient of the magnets (1/K).
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``, ``E_NOT_IDENTIFIABLE``.
     """
     tolerance = tolerance or SensorTolerance()
     pairs = pairs_of(speeds)
@@ -288,6 +285,8 @@ def check_magnet(before: Trace, again: Trace, flux: FluxResult, alpha_psi_per_k:
 
     Gains, inverter error and saturation are those of both, and cancel.
 
+    Raises IdentificationError: ``E_MAGNET_CHANGED``.
+
     Parameters
     ----------
     before, again : Trace
@@ -296,11 +295,6 @@ def check_magnet(before: Trace, again: Trace, flux: FluxResult, alpha_psi_per_k:
         Of the run before; its residuals say how well one pair is known.
     alpha_psi_per_k : float
         Temperature coefficient of the magnet flux (1/K).
-
-    Raises
-    ------
-    IdentificationError
-        ``E_MAGNET_CHANGED``.
     """
     pairs = (before, list(fastest_pair(before))), (again, [0, 1])
     psi = [float(np.mean(rows["u_q_v"][at] / rows["omega_e_rad_s"][at])) for rows, at in pairs]

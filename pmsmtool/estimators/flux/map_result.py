@@ -154,6 +154,9 @@ def estimate_flux_map(
 ) -> FluxMapResult:
     """Estimate the flux map from pulse traces.
 
+    Raises IdentificationError: ``E_CLIPPED``, ``E_EXCITATION`` (pulses or plane incomplete), ``E_MODEL_MISMATCH``,
+    ``E_NOT_IDENTIFIABLE`` (a flux that does not rise with its current).
+
     Parameters
     ----------
     traces : sequence of Trace
@@ -172,12 +175,6 @@ def estimate_flux_map(
         Take the axis of symmetry as d axis: a held rotor, whose offset no speed run has measured.
     tolerance : SensorTolerance
         Declared sensor tolerances.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_CLIPPED``, ``E_EXCITATION`` (pulses or plane incomplete), ``E_MODEL_MISMATCH``, ``E_NOT_IDENTIFIABLE`` (a
-        flux that does not rise with its current).
     """
     tolerance = tolerance or SensorTolerance()
     _check_pulses(traces)

@@ -103,6 +103,9 @@ def flux_by_voltage_limit(
 ) -> Estimate:
     """Return the flux linkage (Wb) from the speed at which the voltage ends.
 
+    Raises IdentificationError: ``E_NOT_SETTLED``: the speed still changes; ``E_EXCITATION``: the torque asked for is
+    friction's.
+
     Parameters
     ----------
     top : Trace
@@ -111,11 +114,6 @@ def flux_by_voltage_limit(
         Largest phase voltage amplitude over the DC link.
     dead_time_share : float, optional
         Dead time over control period, where known.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_NOT_SETTLED``: the speed still changes; ``E_EXCITATION``: the torque asked for is friction's.
     """
     t = top.t_s - top.t_s[0]
     half = len(top) // 2

@@ -186,6 +186,8 @@ def fit_axis(
 ) -> AxisFit:
     """Fit one axis jointly over its shots.
 
+    Raises IdentificationError: ``E_EXCITATION`` when the current does not follow, ``E_NOT_CONVERGED``.
+
     Parameters
     ----------
     shots : sequence of Shot
@@ -204,11 +206,6 @@ def fit_axis(
         the bend gains there counts here.
     instant : ShownInstant or None
         What a turning machine shows of delay and lag.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION`` when the current does not follow, ``E_NOT_CONVERGED``.
     """
     slow = [shot.slow_basis() for shot in shots]
     ripple = max(float(np.std(shot.i_a[SKIP_SAMPLES:])) for shot in shots)

@@ -154,6 +154,9 @@ def estimate_inductances(
 ) -> InductanceResult:
     """Incremental inductances from square-wave shots.
 
+    Raises IdentificationError: ``E_EXCITATION``, ``E_CLIPPED``, ``E_ROTOR_MOVED``, ``E_MODEL_MISMATCH``,
+    ``E_NOT_IDENTIFIABLE``.
+
     Parameters
     ----------
     d_shots, q_shots : sequence of Trace
@@ -180,11 +183,6 @@ def estimate_inductances(
     further : mapping of str to sequence of (Trace, float), optional
         Shots at two more angles of the rotor by axis, with the shortest half period, and the angle of the frame ahead
         of the rotor's d axis during each (rad electrical): L is then the mean over the angle.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``, ``E_CLIPPED``, ``E_ROTOR_MOVED``, ``E_MODEL_MISMATCH``, ``E_NOT_IDENTIFIABLE``.
     """
     tolerance = tolerance or SensorTolerance()
     cross: dict[str, tuple[float, float]] = {}

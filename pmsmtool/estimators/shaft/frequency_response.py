@@ -150,6 +150,8 @@ def estimate_frequency_response(
 ) -> FrequencyResponse:
     """Estimate the response, the inertia, and the resonance where there is one.
 
+    Raises IdentificationError: ``E_EXCITATION``, ``E_CLIPPED``, ``E_COHERENCE``.
+
     Parameters
     ----------
     runs : sequence of Trace
@@ -166,11 +168,6 @@ def estimate_frequency_response(
         Cogging (N m) of an array of angles along the phase order: it moves the shaft, too; its relative deviation.
     tolerance : SensorTolerance
         Declared sensor tolerances.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``, ``E_CLIPPED``, ``E_COHERENCE``.
     """
     lengths = {len(run) for run in runs}
     given, runs = len(runs), [run for run in runs if not _stopped(run)]

@@ -63,6 +63,8 @@ def estimate_ratios(
 ) -> dict[str, Estimate]:
     """Return ``J_per_psi`` (kg m2/Wb) and ``tau_c_per_psi`` (N m/Wb).
 
+    Raises IdentificationError: ``E_EXCITATION``, ``E_NOT_IDENTIFIABLE``.
+
     Parameters
     ----------
     pushes : sequence of Trace
@@ -71,11 +73,6 @@ def estimate_ratios(
         Pole pairs.
     tolerance : SensorTolerance
         Declared sensor tolerances.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``, ``E_NOT_IDENTIFIABLE``.
     """
     tolerance = tolerance or SensorTolerance()
 
@@ -190,6 +187,8 @@ def _fit(parts: Sequence[Part], sense: float, columns: int) -> tuple[Array, floa
 def regress(columns: Sequence[Array], measured: Array, *, what: str, stage: str) -> Array:
     """Return the least-squares coefficients, shape (k,); columns are scaled to unit mean square.
 
+    Raises IdentificationError: ``E_NOT_IDENTIFIABLE``: a column of zeros, or columns that are nearly one another's sum.
+
     Parameters
     ----------
     columns : sequence of ndarray, shape (n,)
@@ -198,11 +197,6 @@ def regress(columns: Sequence[Array], measured: Array, *, what: str, stage: str)
         Left side.
     what, stage : str
         What is to be told apart and where, for the refusal.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_NOT_IDENTIFIABLE``: a column of zeros, or columns that are nearly one another's sum.
     """
     matrix = np.column_stack(columns)
     scale = np.sqrt(np.mean(matrix**2, axis=0))

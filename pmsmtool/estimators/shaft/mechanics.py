@@ -157,6 +157,9 @@ def estimate_mechanics(
 ) -> MechanicsResult:
     """Estimate inertia and friction.
 
+    Raises IdentificationError: ``E_CLIPPED``, ``E_EXCITATION``, ``E_NOT_IDENTIFIABLE``, ``E_NOT_CONVERGED``,
+    ``E_MODEL_MISMATCH``.
+
     Parameters
     ----------
     runs : sequence of Trace
@@ -182,11 +185,6 @@ def estimate_mechanics(
         Its error once and twice per turn along the phase order (rad), as a slow rotation shows it.
     elastic : bool
         Count any deviation of the torque as noise: the caller has another method to compare the inertia with.
-
-    Raises
-    ------
-    IdentificationError
-        ``E_CLIPPED``, ``E_EXCITATION``, ``E_NOT_IDENTIFIABLE``, ``E_NOT_CONVERGED``, ``E_MODEL_MISMATCH``.
     """
     tolerance = tolerance or SensorTolerance()
     if len(runs) < TRACES_LEAST:

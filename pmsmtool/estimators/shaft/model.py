@@ -151,6 +151,9 @@ def whitener(run: Run, J: float) -> Array:
 def positions(torque: Array, T: float, x: Array) -> Array:
     """Return the positions (rad) at the ends of intervals of constant torque, shape (n + 1,).
 
+    Raises OverflowError: the speed would grow or decay within a fiftieth of an interval: a step of a fit that leads
+    nowhere.
+
     Parameters
     ----------
     torque : ndarray, shape (n,)
@@ -159,11 +162,6 @@ def positions(torque: Array, T: float, x: Array) -> Array:
         Length of an interval (s).
     x : ndarray, shape (5,)
         ln J, B, tau_c, first position and first speed.
-
-    Raises
-    ------
-    OverflowError
-        The speed would grow or decay within a fiftieth of an interval: a step of a fit that leads nowhere.
     """
     J, B, tau_c = math.exp(float(x[0])), float(x[1]), float(x[2])
     if not abs(B) * T <= DECAY_MOST * J:

@@ -65,15 +65,12 @@ def encoder_step(traces: Sequence[Array]) -> float:
 
     A shaft that slows down turns by many steps of a fine encoder in second differences, too: 22 bits were taken for 13.
 
+    Raises IdentificationError: ``E_EXCITATION``: the shaft turned by too few steps in a trace.
+
     Parameters
     ----------
     traces : sequence of ndarray, shape (n,)
         Positions of every trace (rad).
-
-    Raises
-    ------
-    IdentificationError
-        ``E_EXCITATION``: the shaft turned by too few steps in a trace.
     """
     found = [_finest(np.concatenate([_steps(theta, order) for theta in traces], axis=1)) for order in ROUNDINGS_LEAST]
     step = min(filter(None, found), default=0.0)
