@@ -44,6 +44,7 @@ from pmsmtool.sim.scenarios import FILE_EXAMPLE, load_scenario
 from pmsmtool.toml_file import parse_toml
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_csv, trace_npz
+from tests.test_layers import parsed
 
 ROOT = Path(__file__).resolve().parents[1]
 ATTEMPTS = 60
@@ -245,7 +246,7 @@ def test_every_other_error_names_a_next_step() -> None:
     bare = []
     for path in sorted((ROOT / "pmsmtool").rglob("*.py")):
         module = path.relative_to(ROOT / "pmsmtool").with_suffix("").as_posix()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path.read_text(encoding="utf-8"))):
             if not isinstance(node, ast.Call) or getattr(node.func, "id", "") not in ERRORS - HAVE_A_STEP:
                 continue
             behind = module in ELSEWHERE or (module in READERS and ast.unparse(node.func) == "ConfigError")

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.data_types import BY_SHORT, DATA_TYPES
+from tests.test_layers import parsed
 
 PACKAGE = Path(__file__).resolve().parent.parent / "pmsmtool"
 PATTERNS = {
@@ -41,7 +42,7 @@ def copies(name: str, source: str) -> Iterator[str]:
             yield from (f"{name}: {match[0]!r} belongs to {home}" for match in pattern.finditer(source))
     if name == "data_types.py" or Path(name).name in OTHER_NUMBERS:
         return
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(parsed(source)):
         if isinstance(node, ast.Dict):
             keys = {key.value for key in node.keys if isinstance(key, ast.Constant)}
             if len(keys & TYPE_NAMES) > 2:

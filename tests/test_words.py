@@ -6,9 +6,12 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
+
+from tests.test_layers import parsed
 
 ROOT = Path(__file__).resolve().parents[1]
 COINED = {
@@ -56,10 +59,11 @@ PAGES = sorted([*(ROOT / "docs").glob("*.md"), ROOT / "README.md", ROOT / "firmw
 SOURCES = sorted((ROOT / "pmsmtool").rglob("*.py"))
 
 
-def prose(source: str) -> Iterator[str]:
+@cache
+def prose(source: str) -> tuple[str, ...]:
     """String literals that a person may read: those with a blank, docstrings of commands alone; no expressions."""
-    tree = ast.parse(source)
-    unread = set()
+    tree = parsed(source)
+    unread, read = set(), []
     for node in ast.walk(tree):
         for statement in getattr(node, "body", None) or [] if not isinstance(node, (ast.Lambda, ast.IfExp)) else []:
             if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
@@ -69,10 +73,11 @@ def prose(source: str) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
             unread |= {part for part in node.values if isinstance(part, ast.Constant)}
-            yield "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
+            read.append("".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values))
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in unread and " " in node.value:
-            yield node.value
+            read.append(node.value)
+    return tuple(read)
 
 
 def found(text: str) -> list[str]:
