@@ -16,7 +16,7 @@ from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import SensorTolerance, Verdict
 from pmsmtool.estimators.injection import angle_dependence, inductance
-from pmsmtool.estimators.injection.angle_dependence import UNEVEN, UNSEEN, UNSEEN_RANGE, AngleDependence, over_angle
+from pmsmtool.estimators.injection.angle_dependence import UNEVEN, UNSEEN_RANGE, AngleDependence, over_angle
 from pmsmtool.estimators.injection.axis_fit import AxisFit
 from pmsmtool.estimators.injection.axis_layout import Timing
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, VoltageError
@@ -274,25 +274,27 @@ def test_a_temperature_is_the_mean_of_what_records_and_sensors_say() -> None:
 
 
 def _over(monkeypatch: pytest.MonkeyPatch, logs: Sequence[float], angles: Sequence[float],
-          mixed: Sequence[float] = ()) -> AngleDependence | None:  # fmt: skip
+          mixed: Sequence[float] = ()) -> AngleDependence:  # fmt: skip
     values = iter(logs)
     monkeypatch.setattr(angle_dependence, "_log_inductance", lambda *_: next(values))
     shot = _shot()
     return over_angle(_fit(L_D), shot, [shot] * (len(logs) - 1), angles, mixed)
 
 
-def test_two_angles_a_quarter_of_a_turn_apart_have_a_mean(monkeypatch: pytest.MonkeyPatch) -> None:
-    off = math.radians(8.0)
-    found = _over(monkeypatch, [0.01, 0.03, 0.07], [0.2, 0.2 - 0.5 * math.pi + off], [0.005, 0.001])
-    ratios = (0.02 - 0.005, 0.06 - 0.001)
-    mean = sum(ratios) / 2.0
-    assert found is not None and found.mean == pytest.approx(math.exp(mean), rel=EXACT)
-    assert found.spread == pytest.approx(mean * (1.0 + math.sin(3.0 * off)), rel=EXACT)  # zero is the farthest
-    apart = _over(monkeypatch, [0.0, 0.01, 0.05], [0.2, 0.2 + 0.5 * math.pi + math.radians(10.1)])
-    assert apart == AngleDependence(1.0, pytest.approx(UNSEEN * 0.05))  # type: ignore[arg-type]
-    assert _over(monkeypatch, [0.0, 0.01], [0.2]) == AngleDependence(1.0, UNSEEN_RANGE)
-    assert _over(monkeypatch, [0.0, UNEVEN, 0.99 * UNEVEN], [0.2, 0.2 + 0.5 * math.pi]) == AngleDependence(1.0, 0.0)
-    assert _over(monkeypatch, [0.0, UNEVEN], [0.2]) is None
+def test_a_mean_over_the_angle_takes_what_the_frame_sees_of_the_other_axis_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    angles = [0.0, 0.25 * math.pi / 3.0, 0.25 * math.pi / 3.0 + 0.5 * math.pi]
+    found = _over(monkeypatch, [0.01, 0.03, 0.07], angles, [0.005, 0.001])
+    ratios = np.array([0.02 - 0.005, 0.06 - 0.001])
+    covariance, lever, std = angle_dependence._harmonics(angles)
+    mean = float(lever @ np.linalg.solve(covariance, ratios))
+    assert mean == pytest.approx(0.5 * sum(ratios), rel=0.01)  # measured 0.004: harmonics are not endless
+    assert found.mean == pytest.approx(math.exp(mean), rel=EXACT)
+    scale = math.sqrt((1.0 + float(ratios @ np.linalg.solve(covariance, ratios))) / 3.0)
+    assert found.spread == pytest.approx(mean + 1.959963984540054 * scale * std, rel=EXACT)  # zero is the farthest
+    even = _over(monkeypatch, [0.0, UNEVEN, 0.99 * UNEVEN], angles)
+    assert even == AngleDependence(1.0, 0.0)
+    one = _over(monkeypatch, [0.0, UNEVEN], angles[:2])
+    assert one.mean == 1.0 and one.spread == pytest.approx(0.024, abs=2e-3)
 
 
 def test_an_inductance_over_the_angle_has_its_change_in_the_interval() -> None:
@@ -301,11 +303,12 @@ def test_an_inductance_over_the_angle_has_its_change_in_the_interval() -> None:
     assert (found.value, found.std) == pytest.approx((2.04e-3, 1.02e-6), rel=EXACT)
     assert found.systematic == pytest.approx(math.hypot(1.02 * 3e-5, 0.013 * 2.04e-3), rel=EXACT)
     assert found.fallback == "mean over the angle, it changes by 1.3 %; frame unknown"
-    assert inductance._with_angle(L, AngleDependence(1.0, 0.05)).fallback.startswith("at one angle, it changes by 5 %")
+    unshown = inductance._with_angle(L, AngleDependence(1.0, 0.05))
+    assert "no change over the angle seen nor excluded: 5 %" in unshown.fallback
     assert inductance._with_angle(L, AngleDependence(1.0, 0.0)) == L
     unseen = inductance._with_angle(L, None)
     assert unseen.systematic == pytest.approx(math.hypot(3e-5, UNSEEN_RANGE * 2e-3), rel=EXACT)
-    assert "at one angle of the rotor" in unseen.fallback and "by 5 % is assumed" in unseen.fallback
+    assert unseen.fallback == unshown.fallback
 
 
 # ---- the whole, with axes that are known ------------------------------------------------------------------------

@@ -70,10 +70,6 @@ two branches, left 1.13 and 1.69 of it, and L_d, L_q 1.4 and 2.5 % off."""
 MINIMUM_PERIODS = 20
 """Full periods of the square wave below which a shot is not an excitation."""
 CURVE_POINTS = 256
-ONE_ANGLE = (
-    "at one angle of the rotor: that unequal phases and slots change it over the angle by "
-    f"{100.0 * UNSEEN_RANGE:.2g} % is assumed"
-)
 FRAME_LIMIT_RAD = math.radians(30.0)
 """Angle of the frame off the d axis beyond which the axes are not separated: at 45 deg they cannot be."""
 ANISOTROPY_LIMIT = 0.03
@@ -181,7 +177,7 @@ def estimate_inductances(
     tolerance : SensorTolerance
         Declared sensor tolerances.
     further : mapping of str to sequence of (Trace, float), optional
-        Shots at two more angles of the rotor by axis, with the shortest half period, and the angle of the frame ahead
+        Shots at more angles of the rotor by axis, with the shortest half period, and the angle of the frame ahead
         of the rotor's d axis during each (rad electrical): L is then the mean over the angle.
     """
     tolerance = tolerance or SensorTolerance()
@@ -219,7 +215,8 @@ def estimate_inductances(
         else:
             frame, fallback = FrameAhead(0.0, 0.0, 0.0), "frame offset unknown, machine nearly round: axes as they are"
     values, stds = _unmix(fits, {axis: factor for axis, (_, factor, _) in widen.items()}, frame)
-    uneven = _over_angle(fits, shots, further or {}, inverter, U_dc_v, frame, values)
+    stood = {axis: float(records[0].meta["fixed_angle_rad"]) for axis, records in traces.items()}
+    uneven = _over_angle(fits, shots, further or {}, inverter, U_dc_v, frame, stood, values)
     biases = {"d": _bias(d_shots, frame.d_rad), "q": _bias(q_shots, frame.q_rad)}
     dependent = tuple(
         axis
@@ -282,6 +279,7 @@ def _over_angle(
     inverter: InverterCurve | None,
     U_dc_v: float,
     frame: FrameAhead,
+    frames_rad: Mapping[str, float],
     L_h: Mapping[str, float],
 ) -> dict[str, AngleDependence]:
     """Return by axis how its inductance depends on the angle of the rotor, where that was measured.
@@ -302,19 +300,18 @@ def _over_angle(
         across = inverse["q" if axis == "d" else "d"] / inverse[axis] - 1.0
         aheads = [frame.d_rad if axis == "d" else frame.q_rad, *(ahead for _, ahead in records)]
         here, *mixed = (-math.log1p(across * math.sin(ahead) ** 2) for ahead in aheads)
-        angles = [float(record.meta["fixed_angle_rad"]) - ahead for record, ahead in records]
-        if others and (at := over_angle(fits[axis], shots[axis][0], others, angles, [there - here for there in mixed])):
-            found[axis] = at
+        stood = [frames_rad[axis], *(float(record.meta["fixed_angle_rad"]) for record, _ in records)]
+        angles = [frame_rad - ahead for frame_rad, ahead in zip(stood, aheads, strict=True)]
+        if others:
+            found[axis] = over_angle(fits[axis], shots[axis][0], others, angles, [there - here for there in mixed])
     return found
 
 
 def _with_angle(L: Estimate, at: AngleDependence | None) -> Estimate:
     """Return an inductance as the mean over the angle. A controller of one L meets all: how far it goes is inside."""
-    if at is None:
-        told, at = ONE_ANGLE, AngleDependence(1.0, UNSEEN_RANGE)
-    else:
-        where = "mean over the angle" if at.mean != 1.0 else "at one angle"
-        told = f"{where}, it changes by {100.0 * at.spread:.2g} %" if at.spread else ""
+    at = at or AngleDependence(1.0, UNSEEN_RANGE)
+    seen = "mean over the angle, it changes by" if at.mean != 1.0 else "no change over the angle seen nor excluded:"
+    told = f"{seen} {100.0 * at.spread:.2g} %" if at.spread else ""
     return replace(
         L,
         value=at.mean * L.value,
