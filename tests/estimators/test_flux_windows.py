@@ -42,6 +42,7 @@ from pmsmtool.estimators.flux.linkage_rows import (
     corrected,
     mean_inverter_error,
     pairs_of,
+    unlimited,
 )
 from pmsmtool.estimators.injection.sampling_instant import Sampling, course_s2, sampled_ripple
 from pmsmtool.estimators.injection.switching_ripple import Modulation, rippled_error_dq_v
@@ -150,12 +151,16 @@ def test_a_speed_or_a_current_that_moves_is_told_where_and_by_how_much() -> None
                 _checked(**{f"{axis}_second_a": moved - at * share * CURRENT_SETTLE_LIMIT * largest})
 
 
-def test_limited_windows_are_counted() -> None:
+def test_of_a_pair_with_a_limited_window_none_is_left() -> None:
     flagged = np.zeros(20)
-    _checked(flagged=flagged)
-    flagged[[3, 7]] = 2.0, 1.0
-    with pytest.raises(IdentificationError, match="E_CLIPPED: voltage or current limited in 2 windows"):
-        _checked(flagged=flagged)
+    whole = _changed(_windows(), flagged=flagged)
+    assert np.array_equal(unlimited(whole)["u_q_v"], whole["u_q_v"])
+    (first, second), alone = pairs_of(whole)[1], next(k for k in range(20) if all(k not in p for p in pairs_of(whole)))
+    kept = unlimited(_changed(whole, flagged=np.where(np.isin(np.arange(20), (second, alone)), 2.0, 0.0)))
+    assert np.array_equal(kept["u_q_v"], np.delete(whole["u_q_v"], [first, second, alone]))
+    assert len(kept.t_s) == len(kept) == 17
+    with pytest.raises(IdentificationError, match="E_CLIPPED: voltage or current limited in 17 windows"):
+        check_speeds(kept, [], 17)
 
 
 # ---- what is taken off ------------------------------------------------------------------------------------------

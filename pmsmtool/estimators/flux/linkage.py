@@ -27,7 +27,15 @@ from numpy.typing import NDArray
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.cross_check import cross_check, driven_flux_linkage
 from pmsmtool.estimators.estimate import SensorTolerance, condition_gate, information_weights
-from pmsmtool.estimators.flux.linkage_rows import STAGE, Corrected, check_speeds, corrected, fastest_pair, pairs_of
+from pmsmtool.estimators.flux.linkage_rows import (
+    STAGE,
+    Corrected,
+    check_speeds,
+    corrected,
+    fastest_pair,
+    pairs_of,
+    unlimited,
+)  # fmt: skip
 from pmsmtool.estimators.injection.sampling_instant import CoastingPairs, Sampling, ShownInstant, shown_instant
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.inverter_error import InverterCurve
@@ -167,8 +175,10 @@ def estimate_flux_linkage(
         Reference temperature (degC) and coefficient of the magnets (1/K).
     """
     tolerance = tolerance or SensorTolerance()
+    windows, speeds = len(speeds), unlimited(speeds)
+    limited = windows - len(speeds)
     pairs = pairs_of(speeds)
-    check_speeds(speeds, pairs)
+    check_speeds(speeds, pairs, limited)
     rows = corrected(speeds, R_ohm, period_s, inverter, modulation, lag_s, sampling)
     d_fit, d_std, d_dof = _fit_d(rows)
     even = _fit_even(rows, pairs)
@@ -224,6 +234,7 @@ def estimate_flux_linkage(
         method="coasting in both directions, d currents of both signs, sampled-data correction",
         i_d_apk=0.0,
         i_q_apk=0.0,
+        fallback=f"{limited} of {windows} windows left out, limited by voltage or current" if limited else "",
         dof=even.dof * (std / fitted) ** 4 if fitted > 0.0 else math.inf,  # Welch-Satterthwaite, GUM G.4
     )
     if driven is not None and not apart and std > WIDE * psi:
@@ -409,8 +420,9 @@ def normalised(measured: Estimate, T_ref_c: float, alpha: float, tolerance: Sens
     known = math.isfinite(measured.T_c)
     factor = 1.0 + alpha * (measured.T_c - T_ref_c) if known else 1.0
     value = measured.value / factor
-    thermal = 0.0
+    thermal, told = 0.0, "magnet temperature unknown: psi_f is not normalised"
     if known:
+        told = ""
         away = tolerance.magnet_per_k * (measured.T_c - T_ref_c)
         thermal = math.hypot(alpha * tolerance.temperature_k, away) * value
     return replace(
@@ -418,5 +430,5 @@ def normalised(measured: Estimate, T_ref_c: float, alpha: float, tolerance: Sens
         value=value,
         std=measured.std / factor,
         systematic=math.hypot(measured.systematic / factor, thermal),
-        fallback="" if known else "magnet temperature unknown: psi_f is not normalised",
+        fallback="; ".join(filter(None, (measured.fallback, told))),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -175,8 +175,19 @@ def mean_inverter_error(
     return np.asarray(np.stack(error).reshape(2, n, ANGLES).mean(axis=2))
 
 
-def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]]) -> None:
-    """Refuse a run that was limited or not settled, or that has too few speeds.
+def unlimited(speeds: Trace) -> Trace:
+    """Return the windows in which nothing was limited; of two with d currents of both signs, both or none."""
+    if "flagged" not in speeds.signals:
+        return speeds
+    limited = speeds["flagged"] > 0.0
+    for pair in map(list, pairs_of(speeds)):
+        limited[pair] = np.any(limited[pair])
+    kept = {name: values[~limited] for name, values in speeds.signals.items()}
+    return replace(speeds, t_s=speeds.t_s[~limited], signals=kept)
+
+
+def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]], limited: int = 0) -> None:
+    """Refuse a run that is not settled, or that has too few speeds, as where ``limited`` windows were left out.
 
     Raises IdentificationError: ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``.
     """
@@ -184,15 +195,14 @@ def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]]) -> None:
     for sign, name in ((1.0, "forward"), (-1.0, "backward")):
         mine = np.array([abs(w[k]) for k, _ in pairs if np.sign(w[k]) == sign])
         if len(mine) < MINIMUM_PAIRS or float(np.max(mine)) < SPEED_RATIO * float(np.min(mine)):
+            if limited:
+                raise refuse("E_CLIPPED", f"voltage or current limited in {limited} windows", stage=STAGE)
             raise refuse(
                 "E_EXCITATION",
                 f"{len(mine)} pairs of d currents {name}; {MINIMUM_PAIRS} over speeds of {SPEED_RATIO:g} to 1 are "
                 "needed",
                 stage=STAGE,
             )
-    if "flagged" in speeds.signals and np.any(speeds["flagged"] > 0.0):
-        count = int(np.sum(speeds["flagged"] > 0.0))
-        raise refuse("E_CLIPPED", f"voltage or current limited in {count} windows", stage=STAGE)
     change = np.abs(speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / np.abs(w)
     _check_settled(w, 100.0 * change, 100.0 * SETTLE_LIMIT, "the speed", "%", STOPPED, STOPPED_STEP)
     limit = CURRENT_SETTLE_LIMIT * float(np.max(np.hypot(speeds["i_d_a"], speeds["i_q_a"])))
