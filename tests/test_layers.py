@@ -25,6 +25,7 @@ FLOORS: dict[str, int] = {
     "errors": 0,
     "arrays": 1,
     "plain_text": 1,
+    "refusals": 1,
     "cia402": 1,
     "data_types": 1,
     "files": 1,

@@ -110,7 +110,7 @@ def _exit_codes() -> str:
 
 
 def _refusals() -> str:
-    from pmsmtool.estimators.refusals import REFUSALS
+    from pmsmtool.refusals import REFUSALS
 
     parts = ["A value that cannot be trusted is refused: exit code 6, and one of these names."]
     for row in REFUSALS.values():

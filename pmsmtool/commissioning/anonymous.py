@@ -22,13 +22,13 @@ from pmsmtool.commissioning.report_page import verdict
 from pmsmtool.drive.objects import LIVE, signal_unit
 from pmsmtool.drive.port import Excitation
 from pmsmtool.drive_maps.shipped_maps import family_names
-from pmsmtool.estimators.refusals import REFUSALS
 from pmsmtool.identification.request import Method
 from pmsmtool.identification.run_files import MACHINE, stored_traces
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.capabilities import QUANTITIES, CapabilityLevel
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import read_parameter_set
+from pmsmtool.refusals import REFUSALS
 from pmsmtool.run_directory import RunDirectory, RunRecord, Stage, Status
 from pmsmtool.trace import Trace
 from pmsmtool.units import UNITS

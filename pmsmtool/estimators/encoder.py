@@ -15,8 +15,8 @@ import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS, Harmonic
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "encoder"

@@ -15,8 +15,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 
 CHI2_WARN = 1.25
 """Reduced chi-square above which a result is widened and marked (docs/identification.md, 4)."""

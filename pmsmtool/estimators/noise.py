@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pmsmtool.estimators.refusals import refuse
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 MINIMUM_SAMPLES = 256

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width, total_half_width
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resolved_push import STAGE, push_blocks, resolve
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 DELAY_DOUBT_PERIODS = 0.5

@@ -34,10 +34,10 @@ from pmsmtool.estimators.estimate import (
 from pmsmtool.estimators.inverter_error import InverterCurve, curve_from_levels
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, UNKNOWN_T_RANGE_C, WINDING_TOLERANCE
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "resistance"

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.estimate import CONDITION_LIMIT, MEDIAN_TO_STD, scaled_covariance
-from pmsmtool.estimators.refusals import refuse
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "recorded torque pulses"

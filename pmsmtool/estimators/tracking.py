@@ -23,7 +23,6 @@ import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.estimate import MEDIAN_TO_STD
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.tracking_model import (
     STATES,
     TRACKED,
@@ -33,6 +32,7 @@ from pmsmtool.estimators.tracking_model import (
     model_voltage,
     ripple_v,
 )
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "tracking"

@@ -17,8 +17,8 @@ import numpy as np
 
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
 from pmsmtool.errors import LimitExceeded
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.experiments.signals import readable
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 Axis = Literal["d", "q"]

@@ -28,11 +28,11 @@ from pmsmtool.estimators.angle_harmonics import (
     Harmonic,
 )
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.mechanics import POWERED, Torque
 from pmsmtool.estimators.shaft.position import encoder_step
 from pmsmtool.identification.mechanics import in_frame, torque_of
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.trace import Trace
 

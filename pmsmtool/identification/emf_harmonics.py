@@ -27,9 +27,9 @@ from pmsmtool.estimators.estimate import SensorTolerance, coverage_factor
 from pmsmtool.estimators.injection.sampling_instant import Sampling
 from pmsmtool.estimators.injection.switching_ripple import Modulation, rippled_error_dq_v
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.identification.mechanics import in_frame
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 if TYPE_CHECKING:

@@ -13,7 +13,6 @@ import numpy as np
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS, SURE
 from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.frequency_response import (
     INFORMATION_GAIN,
     FrequencyResponse,
@@ -24,6 +23,7 @@ from pmsmtool.estimators.shaft.response_lines import STAGE
 from pmsmtool.identification.mechanics import in_frame, torque_doubt, torque_of
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.npz_file import npz_bytes
+from pmsmtool.refusals import refuse
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.trace import Trace
 

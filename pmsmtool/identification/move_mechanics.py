@@ -16,11 +16,11 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.axis.move import RESTING
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.inertia_ratio import LEAST_PUSHES, estimate_ratios
 from pmsmtool.identification.by_pulses import either_reading
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 METHOD = "regression over position moves"

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult, normalised
 from pmsmtool.estimators.sensor_mismatch import SensorMismatch, estimate_mismatch
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "phase check"

@@ -17,8 +17,8 @@ import numpy as np
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import FIT_FROM, MEAN_NOISE_FACTOR, MODEL_FLOOR
+from pmsmtool.refusals import refuse
 
 STAGE = "plan"
 TAIL = (1, 2)

@@ -16,8 +16,8 @@ import math
 import numpy as np
 
 from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "bench supply"

@@ -7,8 +7,8 @@ import math
 from dataclasses import dataclass, replace
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.refusals import refuse
 from pmsmtool.units import format_current, rpm_from_rad_s
 
 LEAST_SPEED_SHARE = 0.03

@@ -10,12 +10,12 @@ from itertools import count
 from typing import TYPE_CHECKING
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.experiments import mechanics_run, speed_run
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.identification.cogging import SLOW_TRACE
 from pmsmtool.identification.mechanics import TRACE
 from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 

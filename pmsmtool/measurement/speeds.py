@@ -13,7 +13,6 @@ from pmsmtool.arrays import Array
 from pmsmtool.design.loops.current_loop import imc
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.encoder import EncoderResult
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import speed_run
 from pmsmtool.experiments.shaft_answer import FIRST_S, FIRST_SHARE
@@ -23,6 +22,7 @@ from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.measurement.effort import ALL_SPEEDS, SpeedEffort
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.mechanics import numbered
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 from pmsmtool.units import rpm_from_rad_s
 

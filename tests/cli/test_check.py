@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.commissioning.first_check import fault_row
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.identification.wiring import WRONG, judge_supply
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.refusals import refuse
 from tests.cli.conftest import Tool
 
 STATED = "interior-2k2"

@@ -16,9 +16,9 @@ from scipy.signal import lfilter
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, coverage_factor
+from pmsmtool.estimators.estimate import CHI2_WARN, COVERAGE_FACTOR, SensorTolerance, coverage_factor
 from pmsmtool.estimators.injection import axis_fit, sampling_instant
-from pmsmtool.estimators.injection.axis_fit import DISPERSION_PENALTY, LEAST_R, PENALTY
+from pmsmtool.estimators.injection.axis_fit import DISPERSION_PENALTY, LEAST_R, MOST_R, PENALTY
 from pmsmtool.estimators.injection.axis_layout import Effects, Layout, Motion, Timing
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot
 from pmsmtool.estimators.injection.sampling_instant import CoastingPairs, shown_instant
@@ -161,6 +161,27 @@ def test_what_drives_itself_or_stands_for_something_else_is_no_model() -> None:
     ringing[Effects()] = lost
     only = axis_fit._average(shots, slow, 0.05, ringing, None)
     assert only.L_h == pytest.approx(2e-3 * math.exp(0.02), rel=EXACT) and only.effects == ()
+
+
+def test_a_larger_resistance_than_the_loop_s_is_no_model_where_eddy_currents_fit() -> None:
+    """The model without them has the better criterion, and a smaller L, in each case."""
+    shots = _shots()
+    slow = [shot.slow_basis() for shot in shots]
+    plain, eddy = _layout(dispersion=True), _layout(eddy=True)
+    bare = {_layout(lag=lag).effects: (_fit([0.2, 1.0, 1.0, *[-2.0] * lag, 0.3, -0.2], 900.0), _layout(lag=lag))
+            for lag in (True, False)}  # fmt: skip
+
+    def L_h(R: float, R_eddy: float = 1.0, chi2: float = 0.9) -> float:
+        x = [0.5, R_eddy, 1.0, -2.0, 0.1, -1.0, 0.3, -0.2]
+        tried = {
+            plain.effects: (_fit([0.01, R, 1.0, -2.0, 0.05, -0.1, 0.3, -0.2], 100.0), plain),
+            eddy.effects: (_fit(x, chi2 * (300 - len(x)), seed=9), eddy),
+        }
+        return math.log(axis_fit._average(shots, slow, 0.05, bare | tried, None).L_h / 2e-3)
+
+    assert L_h(1.01 * MOST_R) == pytest.approx(0.5, abs=0.02)
+    for kept in (L_h(0.99 * MOST_R), L_h(1.01 * MOST_R, 1.01 * MOST_R), L_h(1.01 * MOST_R, chi2=1.01 * CHI2_WARN)):
+        assert kept == pytest.approx(0.01, abs=0.02)
 
 
 def test_two_inductances_are_known_no_better_than_half_their_difference() -> None:

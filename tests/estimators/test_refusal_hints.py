@@ -15,8 +15,8 @@ import pmsmtool.estimators
 from pmsmtool.cli.identify import identify_command
 from pmsmtool.cli.main import cli
 from pmsmtool.cli.track import track_command
-from pmsmtool.estimators.refusals import REFUSALS
 from pmsmtool.identification.request import NEEDS
+from pmsmtool.refusals import REFUSALS
 
 SETTINGS = {
     "amplitude": "--i-max",

@@ -11,10 +11,10 @@ import pytest
 
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.identification.evaluate import Evaluation
 from pmsmtool.identification.value_verdict import summary_of
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 
 PSI = 0.1
 

@@ -11,7 +11,6 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.errors import DriveFault, IdentificationError
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.identification.replay import replay
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.identification.run_files import MACHINE, REFUSED, refused_in
@@ -22,6 +21,7 @@ from pmsmtool.measurement import mechanics
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.identify import identify
 from pmsmtool.measurement.square_waves import SquareStage
+from pmsmtool.refusals import refuse
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
 

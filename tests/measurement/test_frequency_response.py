@@ -18,7 +18,6 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.errors import IdentificationError, NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.experiments.frequency_response import keep_speed, plan_frequency_response
@@ -43,6 +42,7 @@ from pmsmtool.machine.two_masses import SWING, shafts_of
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.frequency_response import PLAN_LINE
 from pmsmtool.measurement.identify import identify
+from pmsmtool.refusals import refuse
 from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace

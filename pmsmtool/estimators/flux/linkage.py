@@ -40,9 +40,9 @@ from pmsmtool.estimators.injection.sampling_instant import CoastingPairs, Sampli
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.least_squares import linear_solve
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 RELATIVE_FLOOR = 7e-5

@@ -17,11 +17,11 @@ from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.map_fit import CoenergyFit, MagnetFlux, fit_coenergy
 from pmsmtool.estimators.flux.map_rows import Frame
 from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.resistance import ResistanceResult, resistance_warmed
 from pmsmtool.machine.flux_map import FluxMap, require_monotonic
 from pmsmtool.machine.flux_map_check import reciprocal_change
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "flux map"

@@ -17,8 +17,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 BLOCKS = 12

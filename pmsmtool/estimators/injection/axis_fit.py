@@ -27,7 +27,7 @@ from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, arx_
 from pmsmtool.estimators.injection.output_error import respond
 from pmsmtool.estimators.injection.sampling_instant import ShownInstant
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt
-from pmsmtool.estimators.refusals import refuse
+from pmsmtool.refusals import refuse
 
 DISPERSION_SHARE = 0.5
 """Standard deviation of L, of its difference between the injection frequencies where the fit found one."""
@@ -54,6 +54,9 @@ DECIDED = -2.0 * math.log(NEGLIGIBLE_WEIGHT)
 LEAST_R = 0.8
 """Resistance beside eddy currents, of the loop's, below which they stand for something else: with 0.2 to 0.7 of it, and
 time constants of 13 periods, the ripple of a link put L 13 to 40 % off."""
+MOST_R = 1.25
+"""Resistance, of the loop's, above which a model without eddy currents stands for them where one with them fits: with
+1.4 to 2.6 of it, and an L that falls with the frequency, branches of 3 to 6 % put L 2.6 to 5.5 % off."""
 UNPHYSICAL = 1e9
 """Residual outside the region where the model is defined."""
 
@@ -320,6 +323,8 @@ def _average(
     firsts = [(row, row[2].responses(row[1].x)[0]) for row in rows]
     rows = [row for row, at in firsts if at.model.eddy_s >= 0.0 and (row[2].motion is not None or at.motion >= 0.0)]
     rows = [row for row in rows if not row[0].eddy or row[1].x[1] > LEAST_R]
+    if any(e.eddy and fit.x[1] < MOST_R and fit.cost < CHI2_WARN * fit.dof for e, fit, *_ in rows):
+        rows = [row for row in rows if row[0].eddy or row[1].x[1] < MOST_R]
     if not rows:
         raise refuse("E_NOT_CONVERGED", "no model of the axis could be fitted", stage="inductance")
     weights = information_weights([_criterion(fit, layout, timing) for _, fit, layout, _ in rows])

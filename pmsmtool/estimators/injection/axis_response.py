@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.injection.output_error import AxisModel, Pulses, bend, eddy_current, recursion, respond
-from pmsmtool.estimators.refusals import refuse
+from pmsmtool.refusals import refuse
 
 SKIP_SAMPLES = 10
 """First samples that are simulated but not compared: the voltage before the record and the sensor's start."""

@@ -28,9 +28,9 @@ from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstan
 from pmsmtool.estimators.injection.switching_ripple import LEG_ANGLES
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.position import position_noise
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 MODEL_FLOOR = 1e-4

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from pmsmtool.arrays import Array, Complex
 from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, information_bound, scaled_covariance
 from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, STAGE, local_polynomials, transforms, without_noise
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 RECORDS_LEAST = 3

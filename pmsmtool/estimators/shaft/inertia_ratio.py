@@ -25,9 +25,9 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import CONDITION_LIMIT, SensorTolerance, statistical_half_width
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 Part = tuple[Array, ...]

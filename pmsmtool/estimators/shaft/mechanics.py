@@ -32,11 +32,11 @@ from pmsmtool.estimators.estimate import (
     information_weights,
 )
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt, linear_solve
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.estimators.shaft.disturbances import NONE, TILT_FLOOR, Extent, disturbances, encoder_prior
 from pmsmtool.estimators.shaft.model import SHAFT, Problem, Run, fastest, largest_torque, sizes_of, whitener
 from pmsmtool.estimators.shaft.position import encoder_step, position_noise, position_std
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 Torque = Callable[[Array, Array], Array]

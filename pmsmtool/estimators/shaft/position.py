@@ -22,8 +22,8 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.encoder import EncoderResult, wrapped
 from pmsmtool.estimators.estimate import MEDIAN_TO_STD
-from pmsmtool.estimators.refusals import refuse
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "mechanics"

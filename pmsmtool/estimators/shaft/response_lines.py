@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pmsmtool.arrays import Array, Complex
-from pmsmtool.estimators.refusals import refuse
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "frequency response"
