@@ -142,6 +142,13 @@ def test_a_second_set_point_waits_unless_it_shall_act_at_once(tmp_path: Path, at
         node.disable_voltage()
 
 
+def test_a_position_demand_that_a_file_makes_a_text_stays_one(tmp_path: Path) -> None:
+    """Reading it raised in the simulated drive, whose clock ran on: the reader hung."""
+    rows = (*epos4(), (0x607A, 0, "I32", "rw", ""), (0x6062, 0, "VSTR", "ro", "none"))
+    with opened(write_eds(tmp_path / "drive.eds", rows)) as node:
+        assert node.sdo.upload(0x6062, 0).data == b"none"
+
+
 def test_its_own_current_limit_acts(tmp_path: Path) -> None:
     with opened(write_eds(tmp_path / "drive.eds", copley())) as node:
         node.sdo.download(0x2110, 0, (60).to_bytes(2, "little"))  # 0.6 A peak

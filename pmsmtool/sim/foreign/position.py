@@ -127,7 +127,8 @@ class PositionLoop:
             entry: Entry = self._find(index, 0)
         except Refused:  # the drive has no such object
             return
-        entry.source = lambda: entry.encode(value())
+        if entry.code is not None:  # a file may make it a text
+            entry.source = lambda: entry.encode(value())
 
     def _count(self, turns: float) -> float:
         half = WORD_TURNS // 2
