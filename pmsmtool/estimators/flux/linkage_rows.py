@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,7 +184,9 @@ def unlimited(speeds: Trace) -> Trace:
     limited = speeds["flagged"] > 0.0
     for pair in map(list, pairs_of(speeds)):
         limited[pair] = np.any(limited[pair])
-    kept = {name: values[~limited] for name, values in speeds.signals.items()}
+    kept: Any = copy.copy(speeds.signals)  # those of a file name it where one is missing
+    for name, values in speeds.signals.items():
+        kept[name] = values[~limited]
     return replace(speeds, t_s=speeds.t_s[~limited], signals=kept)
 
 
