@@ -20,7 +20,8 @@ the machine was energised (the hardware stop is named), otherwise 3 (or 8).
 After each: the drive off by itself within a second, its set the old or the new one, never mixed. An open journal may be
 left where the tool was killed or cut off; then `restore` must end well, with exactly the old set.
 
-A line per moment that breaks this, and a summary; exit 1 when there is one.
+A line per moment that breaks this, and a summary; exit 1 when there is one. `map learn` is interrupted by
+``interrupted_learning.py``.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ import signal
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,10 @@ BEFORE_THE_STORE = 20
 _STORE_REQUESTED = b"\x23\x10\x10\x01"
 _CONTROLWORD_WRITTEN = b"\x2b\x40\x60\x00"
 _STATUSWORD_READ = b"\x4b\x41\x60\x00"
+_TO_THE_SERVER = 0x600 >> 7
+_SPEED_ASKED = b"\xff\x60"
+LOOK_EVERY = 20
+"""Frames between looks at the drive; where it sends its samples, some ms."""
 TO_DO = ("hardware stop", "reset the drive")
 MEASURING = ("identify", "commission")
 FLASH_STAGE = "commission --resume"
@@ -199,6 +204,10 @@ class Watch:
         self.line = line
         self.in_store = in_store
         self.frames = 0
+        self.written_at: list[int] = []
+        """Frames by which the tool wrote an object other than a speed."""
+        self.look: Callable[[], None] = lambda: None
+        """Called some hundred times a second."""
         self.stored_after = 0
         """Frames until the drive was asked to store."""
         self.stored_until = 0
@@ -219,6 +228,10 @@ class Watch:
         """Count a frame, and let happen what happens at it."""
         self.frames += 1
         data = bytes(frame.data)
+        if frame.arbitration_id >> 7 == _TO_THE_SERVER and data[0] >> 5 == 1 and data[1:3] != _SPEED_ASKED:
+            self.written_at.append(self.frames)
+        if self.frames % LOOK_EVERY == 0:
+            self.look()
         if data[:4] == _CONTROLWORD_WRITTEN and data[4] & 0x0F == Command.ENABLE_OPERATION:
             self.enabled = True
         elif data[:4] == _STATUSWORD_READ:
@@ -238,6 +251,8 @@ class Watch:
         self.happened = True
         if self.how == "ctrl-c":
             signal.raise_signal(signal.SIGINT)
+        elif self.how == "error":
+            raise RuntimeError("an error that nobody expects")
         elif self.how == "power":
             self.line.line.nodes[0].power_cut()
         self._thaws = self.how == "freeze"

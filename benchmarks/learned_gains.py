@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """`map learn` on drives whose gains, forms and conventions a seed drew: what is decided, what is wrong, what is left.
 
-    python -m benchmarks.learned_gains TABLE.csv [--drives 100] [--first 0] [--kills 40] [--processes 2]
+    python -m benchmarks.learned_gains TABLE.csv [--drives 100] [--first 0] [--processes 2]
 
 A table has the columns of ``sim/foreign/file_rows.py``; the nodes are its families that have a velocity mode and gains
 of a speed loop (``sim/foreign/drawn_gains.py``), and one that keeps to CiA 402. Machines are random
@@ -9,8 +9,8 @@ of a speed loop (``sim/foreign/drawn_gains.py``), and one that keeps to CiA 402.
 
 A scale is right within 12 %; the truth is what one count does on this machine (its magnets are not at 20 degC, so the
 drive's own newton metre is not one). *Wrong* is a decided scale, form or convention that is not the truth. After every
-run the gains are compared, and the largest speed of the shaft with the limit. With ``--kills`` the bus is cut at a
-drawn change of a gain, the tool's process counts as dead, and another command follows: the gains must be back.
+run the gains are compared, and the largest speed of the shaft with the limit. Runs that are killed:
+``interrupted_learning.py``.
 """
 
 from __future__ import annotations
@@ -34,11 +34,9 @@ from pmsmtool.bus.connect import connect
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
-from pmsmtool.drive.guard import GuardedDrive
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
 from pmsmtool.drive_maps.shipped_maps import family_of, load_family
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.flash.gain_journal import any_left, restore_left
 from pmsmtool.identification.learned_gains import Learned
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.temperature import magnet_flux_at
@@ -68,10 +66,6 @@ CIA402 = (
     "0x60FF,0,INTEGER32,rw,0", "0x60F9,1,UNSIGNED16,rw,0", "0x60F9,2,UNSIGNED16,rw,0", "0x6502,0,UNSIGNED32,ro,0x104",
 )  # fmt: skip
 """A drive of the standard alone: torque is not offered, the cyclic velocity mode is."""
-
-
-class Killed(BaseException):
-    """The tool's process is dead."""
 
 
 @dataclass(slots=True)
@@ -132,8 +126,8 @@ def _held(connection: Connection, gains: DrawnGains) -> tuple[bytes, bytes]:
     return dictionary.find(*gains.gain).value, dictionary.find(*gains.integral).value
 
 
-def run(seed: int, table: str, *, kill: bool = False) -> Result:
-    """Learn one drive's gains; with ``kill`` the bus is cut at a drawn change of a gain."""
+def run(seed: int, table: str) -> Result:
+    """Learn one drive's gains."""
     family = FAMILIES[seed % len(FAMILIES)]
     result = Result(seed, family)
     with machine_at(seed, table, family) as channel, connect("pmsmsim", channel) as watching:
@@ -143,27 +137,14 @@ def run(seed: int, table: str, *, kill: bool = False) -> Result:
         told = stated(machine, seed)
         try:
             with connect("pmsmsim", channel) as connection:
-                _learn(connection, told, machine, gains, result, random.Random(seed).randint(1, 4) if kill else 0)
-        except Killed:
-            watching.wait(1.0)
+                _learn(connection, told, machine, gains, result)
         except PmsmtoolError as error:
             result.fault = f"{type(error).__name__}: {error.what}"
-            if kill:
-                watching.wait(1.0)
-        if any_left():
-            node = DriveNode(watching, 1)
-            try:
-                restore_left(node, node.identity())
-            except PmsmtoolError as error:
-                result.fault = f"restore: {error.what}"
-            node.close()
         result.left_changed = _held(watching, gains) != before
     return result
 
 
-def _learn(
-    connection: Connection, told: MachineFile, machine: MachineFile, gains: DrawnGains, result: Result, kill_at: int
-) -> None:
+def _learn(connection: Connection, told: MachineFile, machine: MachineFile, gains: DrawnGains, result: Result) -> None:
     node = DriveNode(connection, 1)
     identity = node.identity()
     node.close()
@@ -184,22 +165,9 @@ def _learn(
         return value
 
     drive.live = live  # type: ignore[method-assign]
-    change, changes = GuardedDrive.change, 0
-
-    def cut(self: GuardedDrive, item: Any, data: bytes) -> None:
-        nonlocal changes
-        change(self, item, data)
-        changes += 1
-        if changes == kill_at:
-            connection.bus._pulled = True  # type: ignore[attr-defined]
-            raise Killed
-
-    if kill_at:
-        GuardedDrive.change = cut  # type: ignore[method-assign]
     try:
         measured = learn_speed_loop(drive, gain, integral, envelope, emf_of(told), lambda text: None)
     finally:
-        GuardedDrive.change = change  # type: ignore[method-assign]
         result.over_speed = largest > OVER * speed_max
     for note in measured.notes:
         result.why["note"] = note
@@ -246,7 +214,6 @@ def main() -> int:
     parser.add_argument("table", type=lambda text: str(Path(text).resolve()))
     parser.add_argument("--drives", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--kills", type=int, default=0)
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.drives)
@@ -260,9 +227,6 @@ def main() -> int:
                 f"{r.seed} {r.family}: {said} {errors} {r.fault} {'; '.join(w for w in r.why.values() if w)}",
                 flush=True,
             )
-        kills = list(
-            pool.map(partial(run, table=options.table, kill=True), range(options.first, options.first + options.kills))
-        )
     counted = Counter((key, verdict) for r in results for key, verdict in r.verdicts.items())
     wrong = sum(n for (_, verdict), n in counted.items() if verdict == "wrong")
     print(f"{len(results)} drives of {len(FAMILIES)} families")
@@ -272,12 +236,9 @@ def main() -> int:
         sizes = sorted(100 * abs(r.errors[key]) for r in results if key in r.errors)
         spread = f"; error median {sizes[len(sizes) // 2]:.1f} %, largest {sizes[-1]:.1f} %" if sizes else ""
         print(f"{key}: decided {right + bad} of {known} ({100 * (right + bad) / known:.0f} %), wrong {bad}{spread}")
-    left = sum(r.left_changed for r in (*results, *kills))
-    fast = sum(r.over_speed for r in (*results, *kills))
-    print(f"gains left changed {left} of {len(results) + len(kills)} ({len(kills)} killed), over-speeds {fast}")
-    for r in kills:
-        if r.left_changed or r.fault.startswith("restore"):
-            print(f"killed {r.seed} {r.family}: {r.fault}")
+    left = sum(r.left_changed for r in results)
+    fast = sum(r.over_speed for r in results)
+    print(f"gains left changed {left} of {len(results)}, over-speeds {fast}")
     return 1 if wrong or left or fast else 0
 
 

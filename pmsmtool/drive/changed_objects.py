@@ -42,7 +42,7 @@ class ChangedObjects:
         self._drive = drive
         self._node = drive.node
         self._before: dict[_Object, bytes] = {}
-        self._lent: dict[_Object, bytes] = {}
+        self._lent: dict[_Object, list[bytes]] = {}
         self._sure: set[_Object] = set()
 
     @property
@@ -129,13 +129,17 @@ class ChangedObjects:
             except SdoAbort:
                 return  # cannot be read, so it cannot be restored; nothing the guard writes is of that kind
         if data and not self._node.map.staging:
-            self._lent[index, sub] = data
+            # before it is written: a program that is killed between leaves what was written last
+            self._lent[index, sub] = [*self._lent.get((index, sub), [])[-1:], data]
             self._keep()
 
     def _keep(self) -> None:
         """Say in the drive's file what is lent; a killed process leaves it."""
         if (path := _path_of(self._drive.identity)) is not None:
-            rows = {f"{i:04X}:{s:02X}": (self._before[i, s].hex(), new.hex()) for (i, s), new in self._lent.items()}
+            rows = {
+                f"{index:04X}:{sub:02X}": [data.hex() for data in (self._before[index, sub], *new)]
+                for (index, sub), new in self._lent.items()
+            }
             with contextlib.suppress(ConfigError):
                 make_folder(path.parent)
                 write_file(path, json.dumps(rows))
@@ -160,8 +164,8 @@ def restore_lent(node: DriveNode, identity: Identity, say: Callable[[str], None]
         return 0
     try:
         lent = {
-            (name, *(int(part, 16) for part in name.split(":", 1))): (bytes.fromhex(old), bytes.fromhex(new))
-            for name, (old, new) in json.loads(read_text(path)).items()
+            (name, *(int(part, 16) for part in name.split(":", 1))): (bytes.fromhex(old), [*map(bytes.fromhex, new)])
+            for name, (old, *new) in json.loads(read_text(path)).items()
         }
     except (ConfigError, ValueError, TypeError, AttributeError):
         path.unlink()
@@ -171,14 +175,14 @@ def restore_lent(node: DriveNode, identity: Identity, say: Callable[[str], None]
             f"(`pmsmtool -n {node.node} nmt reset-node`) before anything is stored: what it has stored comes back"
         )
         return 0
-    refused: dict[str, tuple[str, str]] = {}
+    refused: dict[str, list[str]] = {}
     for (name, index, sub), (old, new) in reversed(lent.items()):
         try:
-            if old != new and node.sdo.read(index, sub) == new:
+            if (held := node.sdo.read(index, sub)) in new and held != old:
                 node.sdo.download(index, sub, old)
                 count += 1
         except SdoAbort:
-            refused[name] = (old.hex(), new.hex())
+            refused[name] = [old.hex(), *map(bytes.hex, new)]
     if refused:
         write_file(path, json.dumps(dict(reversed(refused.items()))))
     else:

@@ -283,8 +283,9 @@ class GuardedDrive:
         self._drive.disable()
 
     def quick_stop(self) -> None:
-        """Stop as fast as the drive can and confirm it."""
-        self.stop()
+        """Stop as fast as the drive can and confirm it; a Ctrl-C meanwhile is raised then."""
+        if self.stop():
+            raise KeyboardInterrupt
 
     def command_current(self, i_d_a: float, i_q_a: float, *, fixed_angle_rad: float | None = None) -> None:
         """Hold a current vector (A peak) within the envelope."""

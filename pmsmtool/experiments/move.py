@@ -62,8 +62,10 @@ def record_move(
             _arrive(guard, drive, target, way_rad)
             guard.wait(settle_s)
     finally:
-        guard.stop()
-        trace = drive.end_samples()
+        try:
+            guard.quick_stop()
+        finally:
+            trace = drive.end_samples()
     doubts = [*([] if seen else [UNSEEN]), *filter(None, [trace.meta["speed_doubt"]])]
     meta = {**trace.meta, "way_rad": way_rad, "doubts": doubts}
     return Trace(trace.t_s, trace.signals, trace.units, meta), found
@@ -89,7 +91,7 @@ def _try_direction(guard: GuardedDrive, drive: PositionDrive, way: float) -> boo
         while clock.now() < until and abs(turned) <= 0.5 * least:
             guard.wait(LOOK_S)
             turned = math.copysign(1.0, way) * (drive.live("theta_m_rad") - start)
-        guard.stop()
+        guard.quick_stop()
         if turned < -0.5 * least:
             raise SafetyRefusal(
                 f"asked to turn by {math.degrees(math.copysign(least, way)):.3g} deg with {share:.0%} of the current, "

@@ -41,9 +41,9 @@ class GainJournal:
         write_snapshot(self.path, self._snapshot)
 
     def note(self, index: int, sub: int, data: bytes) -> None:
-        """Put on disk what is about to be written."""
+        """Put on disk what is about to be written; what was held before leaves what was noted, for it may fail yet."""
         entries = tuple(
-            replace(entry, new=data) if (entry.index, entry.sub) == (index, sub) else entry
+            replace(entry, new=data) if (entry.index, entry.sub) == (index, sub) and data != entry.old else entry
             for entry in self._snapshot.entries
         )
         self._snapshot = replace(self._snapshot, entries=entries)

@@ -7,7 +7,6 @@ down. The drive holds its own gains again when this ends, and the next connectio
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
@@ -30,6 +29,7 @@ STANDARD = {GAIN: (0x60F9, 1), INTEGRAL: (0x60F9, 2)}
 ADDRESS = re.compile(r"0x([0-9A-F]{4}):([0-9A-F]{2})")
 HOLDS = re.compile(r" (?:has|holds) ")
 """Reasons why a map leaves a gain out begin with its objects: "0x2331:01 or 0x60F9:01 has no unit ..."."""
+BACK = "the next `pmsmtool` command that opens this drive restores them, and so does a reset"
 DOWN = 0.7
 """First change of a gain."""
 COARSEST = 0.12
@@ -166,13 +166,16 @@ def changing(
 
             def put(gain: GainObject, counts: float) -> None:
                 data = gain.item.encode(counts)
-                guard.stop()
+                guard.quick_stop()
                 journal.note(gain.item.index, gain.item.sub, data)
                 guard.change(gain.item, data)
 
             yield guard, put
     except PmsmtoolError:
-        with contextlib.suppress(PmsmtoolError):  # what is not back stays in the journal
+        try:
             journal.end(drive.node)
+        except PmsmtoolError:  # what is not back stays in the journal
+            places = ", ".join(gain.address for gain in gains)
+            say(f"gains in {places} may be changed: {BACK}")
         raise
     journal.end(drive.node)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -146,11 +147,10 @@ def learn_speed_loop(
     _refuse_turning(drive)
     with changing(drive, (gain, integral), envelope, say) as (guard, put):
         drive.send_samples()
-        try:
+        with contextlib.ExitStack() as last:
+            last.callback(drive.end_samples)
+            last.callback(guard.quick_stop)
             return _Learner(guard, drive, put, emf, say).run(gain, integral)
-        finally:
-            guard.stop()
-            drive.end_samples()
 
 
 def _margin(own: SpeedLoop, worst: tuple[float, float]) -> float:
@@ -297,7 +297,7 @@ class _Learner:
         lag_s: float | None = None,
     ) -> Observation:
         record = self._record(step)
-        self.guard.stop()  # a fit takes longer than the drive waits for a heartbeat
+        self.guard.quick_stop()  # a fit takes longer than the drive waits for a heartbeat
         loop = fit_speed_loop(record, self.emf, first, lag_s)
         model_std = NO_DOUBT
         if first is not None and lag_s is None:  # what scales rest on

@@ -199,8 +199,9 @@ def test_killed_with_a_changed_gain_the_next_connection_restores(
     monkeypatch.setattr(learn_gains, "fit_speed_loop", lambda *arguments, **options: loop)
     monkeypatch.setattr(learn_gains, "LEAST_S", 0.6)
     monkeypatch.setattr(GuardedDrive, "change", cut)
-    code, _, _ = bench.learn(tool)
+    code, _, said = bench.learn(tool)
     assert code != 0 and bench.counts() != before and any_left()
+    assert "gains in 0x60F9:01, 0x60F9:02 may be changed: the next `pmsmtool` command" in said
     bench.holder.wait(1.0)
     code, _, said = tool("--sim", bench.channel, "info")
     assert "restored" in said and bench.counts() == before and not any_left()

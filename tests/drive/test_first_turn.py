@@ -38,7 +38,7 @@ class Shaft:
     def enable(self) -> None:
         self.enabled, self.target, self.speed = True, self.angle, 0.0
 
-    def stop(self) -> None:
+    def quick_stop(self) -> None:
         self.enabled = False
 
     def live(self, name: str) -> float:

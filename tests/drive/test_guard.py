@@ -136,6 +136,16 @@ def test_second_ctrl_c_while_stopping_still_ends_confirmed(bench: SimBench, mome
     assert bench.memory() == before
 
 
+def test_ctrl_c_while_an_experiment_stops_ends_it(bench: SimBench) -> None:
+    """`map learn` stops ten times; a Ctrl-C then was lost, and it went on to its end (exit code 0)."""
+    with pytest.raises(Interrupted), guarded(bench.drive, ENVELOPE) as guard:
+        guard.enable()
+        bench.bus.clock.after(1e-4, lambda: signal.raise_signal(signal.SIGINT))
+        guard.quick_stop()
+        pytest.fail("the experiment went on")
+    assert bench.session.power.state is State.SWITCH_ON_DISABLED
+
+
 def test_second_ctrl_c_removes_the_voltage_at_once(bench: SimBench) -> None:
     """A quick stop ramp of seconds is cut short."""
     with guarded(bench.drive, Envelope(i_max_apk=5.0, speed_max_rad_s=150.0)) as guard:

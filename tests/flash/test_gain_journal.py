@@ -62,6 +62,13 @@ def test_what_was_left_changed_comes_back_once(rig: tuple[TableDrive, DriveNode,
     assert not any_left() and restore_left(node, identity) == 0
 
 
+def test_killed_between_the_note_of_the_old_value_and_its_write(rig: tuple[TableDrive, DriveNode, Identity]) -> None:
+    """The gain stayed changed, and every later command was refused: it held "neither" (four writes of every run)."""
+    table, node, identity = rig
+    left_changed(table, identity).note(0x60F6, 1, GAIN.encode(300))
+    assert restore_left(node, identity) == 1 and table.written(GAIN, RATE) == [(GAIN, 300)] and not any_left()
+
+
 @pytest.mark.parametrize("status", [0x0237, 0x0217, 0x021F, 0x0000 | 0x77FF])
 def test_an_energised_drive_keeps_what_it_holds(rig: tuple[TableDrive, DriveNode, Identity], status: int) -> None:
     table, node, identity = rig
