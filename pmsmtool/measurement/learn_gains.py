@@ -88,7 +88,7 @@ class LearnedLoop:
 
 
 def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: float, speed_max_rad_s: float) -> float:
-    """Return the largest current that cannot bring the shaft beyond the speed limit before this program sees it.
+    """Return the largest current that needs two checks of the guard from the largest speed of the steps to the limit.
 
     The drive's speed loop keeps the speed, also when the tool is dead; this is for a loop that runs away. A drive with
     a speed limit of its own keeps it; of any other the current is cut.
