@@ -27,7 +27,8 @@ from pmsmtool.sim.closed_loop import image_of
 from pmsmtool.sim.kernel import Part, Simulation, Target
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.signals import Signal, Truth
-from pmsmtool.sim.simulated_machine import RPM, build_setup, with_simulation
+from pmsmtool.sim.simulated_machine import build_setup, with_simulation
+from pmsmtool.units import RAD_S_PER_RPM
 
 PERIODS = 12_000
 REPEATS = 9
@@ -53,10 +54,10 @@ def drive_ns(request: TuneRequest) -> float:
     ideal = {name: value for name, value in IDEAL.items() if name != "rotor"}
     source = with_simulation(load_machine_file(machine_path(PROFILE)), {**ideal, "rotor": "free"})
     source = replace(source, inverter=replace(source.inverter, delay_periods=1.5))
-    setup, keep = build_setup(source, start_rad_s=RPM * 500.0)
+    setup, keep = build_setup(source, start_rad_s=RAD_S_PER_RPM * 500.0)
     image = image_of(source, tune(source, request).parameter_set())
     times = [0.1 * k for k in range(12) for _ in range(2)][1:-1]
-    speeds = [RPM * (500.0 if k % 2 else 750.0) for k in range(11) for _ in range(2)]
+    speeds = [RAD_S_PER_RPM * (500.0 if k % 2 else 750.0) for k in range(11) for _ in range(2)]
     spent = []
     for _ in range(REPEATS):
         simulation = Simulation(setup, image, keep)

@@ -23,7 +23,7 @@ import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
-from pmsmtool.design.lookup.table import RPM, torque_limits
+from pmsmtool.design.lookup.table import torque_limits
 from pmsmtool.design.loops.open_loops import (
     CURRENT_GAINS,
     CURRENT_LOOPS,
@@ -43,6 +43,7 @@ from pmsmtool.errors import ConfigError, DesignInfeasible, NotAvailable
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 from pmsmtool.machine.torque import torque_per_ampere
+from pmsmtool.units import RPM_PER_RAD_S
 
 RATED, SLOPE, TORQUE, CURRENT, SPEED = (
     "reference.tau_rated_nm", "reference.torque_slope_nm_per_s", "speed.tau_max_nm", "motor.I_max_apk",
@@ -319,7 +320,7 @@ class _Projection:
             )
         J = tolerance.factors["J_kgm2"].half_width if "J_kgm2" in tolerance.factors else 0.0
         self.least_J = (machine.J_kgm2 or math.inf) * (1.0 - J)
-        self.per_rpm = machine.pole_pairs / RPM
+        self.per_rpm = machine.pole_pairs / RPM_PER_RAD_S
         self.responses = self._responses(loops)
         self.I_top = min(rated.I_max_apk, rated.tau_max_nm / self.per_ampere)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from pmsmtool.design.design_file import DesignValue, Scalar
-from pmsmtool.design.lookup.table import RPM, torque_limits
+from pmsmtool.design.lookup.table import torque_limits
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import ConfigError
@@ -21,6 +21,7 @@ from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES
+from pmsmtool.units import RPM_PER_RAD_S
 
 RATE_HZ = 240.0
 """Rate of the optimisation (the paper's N_FW = 50 at 12 kHz): slow against a current step, fast against the shaft."""
@@ -152,7 +153,7 @@ def limit_facts(source: MachineFile, rated: Ratings, V_m: float) -> dict[str, Sc
     empty = empty_above_rpm(machine, V_m, rated.I_max_apk)
     facts["field_weakening_empty_above_rpm"] = "never" if math.isinf(empty) else empty
     top = min(rated.n_max_rpm, MTPVA_SHARE * empty)
-    corner = mtpva(machine, top / RPM * machine.pole_pairs, V_m, rated.I_max_apk)
+    corner = mtpva(machine, top / RPM_PER_RAD_S * machine.pole_pairs, V_m, rated.I_max_apk)
     if corner is not None and top > rated.base_speed_rpm:
         facts |= {"mtpva_speed_rpm": top, "mtpva_i_d_a": corner[0], "mtpva_i_q_a": corner[1]}
     return facts
@@ -168,7 +169,9 @@ def mtpv_entry_rpm(machine: MachineParameters, V_m: float, I_max: float) -> floa
     low, high = 0.0, 1.0
     while math.hypot(*mtpv(machine, high, V_m)) > I_max:
         low, high = high, 2.0 * high
-    return RPM / machine.pole_pairs * _bisected(lambda w: math.hypot(*mtpv(machine, w, V_m)) > I_max, low, high)
+    return (
+        RPM_PER_RAD_S / machine.pole_pairs * _bisected(lambda w: math.hypot(*mtpv(machine, w, V_m)) > I_max, low, high)
+    )
 
 
 def empty_above_rpm(machine: MachineParameters, V_m: float, I_max: float) -> float:
@@ -182,7 +185,7 @@ def empty_above_rpm(machine: MachineParameters, V_m: float, I_max: float) -> flo
     while _least_voltage(machine, high, I_max) <= V_m:
         high *= 2.0
     found = _bisected(lambda w: _least_voltage(machine, w, I_max) <= V_m, 0.5 * high, high)
-    return RPM / machine.pole_pairs * found
+    return RPM_PER_RAD_S / machine.pole_pairs * found
 
 
 def _bisected(below: Callable[[float], bool], low: float, high: float) -> float:

@@ -15,12 +15,12 @@ import numpy as np
 
 from pmsmtool.design.admissible_set import Horizon, PredictionModel, StateBounds, horizon, matrix_exponential
 from pmsmtool.design.design_file import DesignValue, Scalar
-from pmsmtool.design.lookup.table import RPM
 from pmsmtool.design.loops.current_loop import CurrentGains
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import GOVERNOR_MODES, K_MAX_NOT_DETERMINED
+from pmsmtool.units import RPM_PER_RAD_S
 
 HEXAGON, PREDICTOR, CURRENT_ROW, PRE_PROJECTION, MINIMUM_TIME = 1, 2, 4, 8, 16
 """Bits of ``governor.options``."""
@@ -131,7 +131,7 @@ def design_governor(
         )
     model = prediction_model(source, gains)
     V_max = source.inverter.V_max_v
-    omega = rated.n_max_rpm / RPM * source.machine.pole_pairs
+    omega = rated.n_max_rpm / RPM_PER_RAD_S * source.machine.pole_pairs
     error = euler_error(model, omega, V_max, rated.I_nom_apk)
     predicts = mode in ("paper", "linearised", "observe")
     chosen, why = _eps(error if predicts else 0.0, eps)
@@ -165,7 +165,7 @@ def _bounded_facts(model: PredictionModel, source: MachineFile, rated: Ratings, 
     for share in BOUNDED_SPEEDS:
         rpm = share * rated.base_speed_rpm
         if 0.0 < rpm <= rated.n_max_rpm:
-            omega = rpm / RPM * source.machine.pole_pairs
+            omega = rpm / RPM_PER_RAD_S * source.machine.pole_pairs
             facts[f"k_max_bounded_states_at_{rpm:.0f}_rpm"] = _fact(
                 horizon(model, omega, source.inverter.V_max_v, eps, bounds, ROWS_IN_DRIVE)
             )

@@ -14,7 +14,7 @@ from typing import cast
 import numpy as np
 
 from pmsmtool.design.design_file import Design, DesignValue
-from pmsmtool.design.lookup.table import RPM, torque_limits
+from pmsmtool.design.lookup.table import torque_limits
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
@@ -22,6 +22,7 @@ from pmsmtool.machine.parameters import MachineParameters, dead_time_compensatio
 from pmsmtool.machine.temperature import loop_coefficient_per_k
 from pmsmtool.machine.uncontrolled_generation import FaultReaction, Protection, fault_reaction
 from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.units import RPM_PER_RAD_S
 
 TRIP_CURRENT_RATIO = 1.5
 """Trip over I_max: room for the overshoot of a current step under 40 % too little inductance, and for noise."""
@@ -187,7 +188,7 @@ def base_speed_rpm(source: MachineFile, I_apk: float, i_d_min_a: float, V_limit_
     if room <= 0.0 or g == 0.0:
         return 0.0
     omega = (-machine.R * t + math.sqrt((machine.R * t) ** 2 + g * room)) / g
-    return omega / machine.pole_pairs * RPM
+    return omega / machine.pole_pairs * RPM_PER_RAD_S
 
 
 def rating_values(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
@@ -261,10 +262,10 @@ def voltage_facts(source: MachineFile, rated: Ratings, V_limit_v: float) -> dict
     plane, facts = at_temperature(source.machine, source.flux_map), {}
     for where, rpm in (("base_speed", rated.base_speed_rpm), ("n_max", rated.n_max_rpm)):
         V = [SAG_SHARE * V_limit_v, V_limit_v]
-        found = torque_limits(plane, [rpm / RPM * plane.pole_pairs], V, rated.I_max_apk, rated.i_d_min_a)
+        found = torque_limits(plane, [rpm / RPM_PER_RAD_S * plane.pole_pairs], V, rated.I_max_apk, rated.i_d_min_a)
         sagged, full = (float(x) for x in np.nan_to_num(found.largest_nm[0]))
         facts[f"sag_torque_share_{where}"] = max(sagged, 0.0) / full if full > 0.0 else 0.0
-    harmonic = source.inverter.harmonic_flux_wb(rated.base_speed_rpm / RPM * plane.pole_pairs)
+    harmonic = source.inverter.harmonic_flux_wb(rated.base_speed_rpm / RPM_PER_RAD_S * plane.pole_pairs)
     return facts if harmonic == 0.0 else {**facts, "overmodulation_harmonic_apk": harmonic / source.machine.L_d_h}
 
 

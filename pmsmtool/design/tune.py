@@ -14,7 +14,6 @@ from pathlib import Path
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.field_weakening import design_field_weakening
 from pmsmtool.design.governor import design_governor
-from pmsmtool.design.lookup.table import RPM
 from pmsmtool.design.loops.bandwidth import CurrentChoice, choose_current
 from pmsmtool.design.loops.current_loop import maximum_delay_periods
 from pmsmtool.design.loops.sampled_loop import LoopMargins, margins
@@ -41,6 +40,7 @@ from pmsmtool.machine.speed_noise import quieter, speed_noise
 from pmsmtool.machine.two_masses import shafts_of, why_slower
 from pmsmtool.params.catalogue import CATALOGUE, FIELD_WEAKENING_MODES
 from pmsmtool.params.parameter_set import SATURATION
+from pmsmtool.units import RPM_PER_RAD_S
 
 PLL_PER_PERIOD = 0.1
 """Default pole of the speed estimate times T_s: a tenth of the sampling rate, 1200 rad/s at 12 kHz."""
@@ -88,7 +88,7 @@ def tune(source: MachineFile | str | Path, request: TuneRequest | None = None) -
     values = {row.name: DesignValue(row.default, "catalogue default") for row in CATALOGUE}
     values |= rating_values(source, rated)
     if (predictor := request.predictor) is None:
-        turn = rated.base_speed_rpm / RPM * source.machine.pole_pairs * source.inverter.T_s
+        turn = rated.base_speed_rpm / RPM_PER_RAD_S * source.machine.pole_pairs * source.inverter.T_s
         delayed = source.inverter.delay_periods >= 1.0 and request.controller == "pi"
         predictor = delayed and turn > PREDICTED_TURN
         request = replace(request, predictor=predictor)
@@ -257,7 +257,7 @@ def _design_speed(
             hint="ask for a lower --speed-bandwidth-hz, or raise the filter and the speed estimate",
         )  # fmt: skip
     how = f"{gains.method}, {gains.omega_c / (2.0 * math.pi):.4g} Hz"
-    slope, why = ACCELERATION_SHARE * rated.tau_max_nm / J * RPM, f"{ACCELERATION_SHARE:g} tau_max / J"
+    slope, why = ACCELERATION_SHARE * rated.tau_max_nm / J * RPM_PER_RAD_S, f"{ACCELERATION_SHARE:g} tau_max / J"
     if FW_SHARE * ramp_limit < slope:
         slope, why = FW_SHARE * ramp_limit, f"{FW_SHARE:g} of the slope that spends the voltage reserve"
     values |= {

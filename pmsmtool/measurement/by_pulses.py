@@ -76,7 +76,6 @@ UNLIMITED_RPM = 1000.0
 """Largest speed on a drive that has no limit of its own and tells none, unless a person or a machine file says more."""
 HEADROOM = 1.2
 """Largest current of the envelope over the test current."""
-RPM = RAD_S_PER_RPM
 
 
 def turn_both_ways(drive: StandardDrive, envelope: Envelope, keep: Keep, say: Say) -> PulseFacts:
@@ -138,8 +137,8 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say)
                 keep("voltage_limit", top)
     voltage: Voltage = "machine" if shows_voltage else "link" if U_dc > 0.0 else ""
     return PulseFacts(
-        Method.STANDARD, pushed=True, voltage=voltage, top_rpm=plan.omega_top_rad_s / RPM, U_dc_v=max(0.0, U_dc),
-        current_undecided=drive.current_undecided, limit="".join(limit),
+        Method.STANDARD, pushed=True, voltage=voltage, top_rpm=plan.omega_top_rad_s / RAD_S_PER_RPM,
+        U_dc_v=max(0.0, U_dc), current_undecided=drive.current_undecided, limit="".join(limit),
     )  # fmt: skip
 
 
@@ -231,7 +230,7 @@ def envelope_of(drive: CanopenDrive, request: IdentifyRequest, known: MachineFil
         )  # fmt: skip
     return Envelope(
         i_max_apk=i_max,
-        speed_max_rad_s=rpm * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,
+        speed_max_rad_s=rpm * RAD_S_PER_RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,
         duration_s=DURATION_S,
         shaft=request.shaft,
         load=request.load,

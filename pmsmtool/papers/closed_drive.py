@@ -18,7 +18,6 @@ from pmsmtool.arrays import Array
 from pmsmtool.cia402 import Mode
 from pmsmtool.design.closed_drive import RATED, SLOPE, TORQUE, ClosedDrive, Guarantee, tune_closed
 from pmsmtool.design.design_file import Design
-from pmsmtool.design.lookup.table import RPM
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import load_family
@@ -38,6 +37,7 @@ from pmsmtool.sim.node.node import Node
 from pmsmtool.sim.node.session import Session
 from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import with_simulation
+from pmsmtool.units import RPM_PER_RAD_S
 
 STANDARD = "cia402"
 """Family of a drive of which only the standard is known."""
@@ -92,7 +92,9 @@ class _Rig:
         """Let the speed follow nodes from :data:`SETTLE_S` on."""
         simulation = self.core.simulation
         times = [0.0, *(1e-9 * simulation.time_ns + SETTLE_S + t for t, _ in rpm)]
-        simulation.schedule(Target.DRIVEN_SPEED, times, [rpm[0][1] / RPM, *(n / RPM for _, n in rpm)])
+        simulation.schedule(
+            Target.DRIVEN_SPEED, times, [rpm[0][1] / RPM_PER_RAD_S, *(n / RPM_PER_RAD_S for _, n in rpm)]
+        )
 
     def _record(self, duration_s: float) -> Array:
         rows = int((duration_s + 1e-9) / (1e-9 * self.core.period_ns))
@@ -101,7 +103,7 @@ class _Rig:
     def _seat(self, record: Array) -> Seat:
         table = record[: self.core.simulation.recorded_rows].T
         return Seat(
-            table[0] - table[0, 0], table[7] * RPM, table[4].copy(), np.hypot(table[1], table[2]),
+            table[0] - table[0, 0], table[7] * RPM_PER_RAD_S, table[4].copy(), np.hypot(table[1], table[2]),
             self.source.inverter.voltage_utilisation * table[3], np.hypot(table[5], table[6]),
         )  # fmt: skip
 

@@ -35,7 +35,7 @@ from pmsmtool.papers.governed_drive import (
 )
 from pmsmtool.papers.registry import JERCIC
 from pmsmtool.papers.statistics import BAND, overshoot, settling_s
-from pmsmtool.sim.simulated_machine import RPM
+from pmsmtool.units import RAD_S_PER_RPM
 
 EPS = 1e-3
 """Tightening of the steady-state row in all laws of a comparison."""
@@ -72,7 +72,7 @@ def laws(alpha: float) -> tuple[Law, ...]:
 
 def transfer(plant: Plant, rpm: float) -> TransferProblem:
     """Return the minimum-time problem of a plant at a speed, V_dc as in the profile."""
-    return TransferProblem(plant.R, plant.L_d, plant.L_q, plant.psi, RPM * plant.pole_pairs * rpm, V_max())
+    return TransferProblem(plant.R, plant.L_d, plant.L_q, plant.psi, RAD_S_PER_RPM * plant.pole_pairs * rpm, V_max())
 
 
 @cache

@@ -25,7 +25,8 @@ from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.sim.kernel import Application, Part, Rotor, Setup, Simulation, Target
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.signals import Signal, Truth
-from pmsmtool.sim.simulated_machine import RPM, build_setup, with_simulation
+from pmsmtool.sim.simulated_machine import build_setup, with_simulation
+from pmsmtool.units import RAD_S_PER_RPM
 
 Whole = NDArray[np.int64]
 
@@ -168,7 +169,7 @@ class Plant:
 
     def voltage(self, i: Array, rpm: Array | float) -> Array:
         """Return the steady-state voltage (V) of currents, shape (..., 2), at a speed."""
-        w = RPM * self.pole_pairs * np.asarray(rpm, dtype=np.float64)
+        w = RAD_S_PER_RPM * self.pole_pairs * np.asarray(rpm, dtype=np.float64)
         u_d = self.R * i[..., 0] - w * self.L_q * i[..., 1]
         u_q = self.R * i[..., 1] + w * (self.L_d * i[..., 0] + self.psi)
         return np.asarray(np.hypot(u_d, u_q))
@@ -326,7 +327,7 @@ class GovernedDrive:
         return round((BOOST_S + REST_S) / T_s) * T_s
 
     def _simulation(self, rpm: float) -> Simulation:
-        self._setup.omega_M = RPM * rpm
+        self._setup.omega_M = RAD_S_PER_RPM * rpm
         self._setup.seed = self.seed
         self.seed += 1
         simulation = Simulation(self._setup, self._image, self._keep)
@@ -337,7 +338,9 @@ class GovernedDrive:
         self, simulation: Simulation, rpm: Sequence[tuple[float, float]], t0: float, duration_s: float
     ) -> Response:
         times = [0.0, *(t0 + t for t, _ in rpm)]
-        simulation.schedule(Target.DRIVEN_SPEED, times, [RPM * rpm[0][1], *(RPM * n for _, n in rpm)])
+        simulation.schedule(
+            Target.DRIVEN_SPEED, times, [RAD_S_PER_RPM * rpm[0][1], *(RAD_S_PER_RPM * n for _, n in rpm)]
+        )
         T_s = 1e-9 * simulation.params.inverter_T_s_ns
         before = round(t0 / T_s)
         simulation.run(before)
@@ -347,5 +350,5 @@ class GovernedDrive:
         table = record.T
         return Response(
             table[0] - table[0, 0], record[:, 1:3].copy(), record[:, 3:5].copy(), record[:, 5:7].copy(),
-            record[:, 7:9].copy(), table[9].astype(np.int64), table[10] / RPM, table[11].copy(),
+            record[:, 7:9].copy(), table[9].astype(np.int64), table[10] / RAD_S_PER_RPM, table[11].copy(),
         )  # fmt: skip

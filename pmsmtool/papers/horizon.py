@@ -13,7 +13,7 @@ from pmsmtool.design.loops.current_loop import CurrentGains, imc, second_order
 from pmsmtool.papers.figure import Check, Column, Reproduction, Table, at_most, near
 from pmsmtool.papers.governed_drive import MODULUS_OPTIMUM, V_max, source
 from pmsmtool.papers.registry import JERCIC
-from pmsmtool.sim.simulated_machine import RPM
+from pmsmtool.units import RAD_S_PER_RPM
 
 EPS: tuple[float | None, ...] = (0.1, 0.01, 1e-3, 1e-4, None)
 """Tightenings of the steady-state row; None: without that row, as printed."""
@@ -73,7 +73,7 @@ def horizons(seed: int) -> Reproduction:
 
 
 def _omega(rpm: float) -> float:
-    return RPM * source().machine.pole_pairs * rpm
+    return RAD_S_PER_RPM * source().machine.pole_pairs * rpm
 
 
 def _gains(name: str, L: float) -> CurrentGains:

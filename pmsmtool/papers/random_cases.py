@@ -14,7 +14,7 @@ from pmsmtool.arrays import Array
 from pmsmtool.design.minimum_time import TransferProblem, minimum_time
 from pmsmtool.papers.governed_drive import GovernedDrive, Plant, V_max, plant_of, source
 from pmsmtool.papers.statistics import BAND, settling_s
-from pmsmtool.sim.simulated_machine import RPM
+from pmsmtool.units import RAD_S_PER_RPM
 
 SPEED_RPM, STANDSTILL_SHARE = 1000.0, 0.05
 """Speeds are uniform up to this, but for a share of cases at standstill."""
@@ -115,7 +115,9 @@ def feasible_for(plant: Plant, count: int, seed: int) -> tuple[Case, ...]:
 def least_time_s(case: Case) -> float:
     """Return the least time (s) to the 2 % ball around the target, nominal machine, circle."""
     plant = plant_of()
-    problem = TransferProblem(plant.R, plant.L_d, plant.L_q, plant.psi, RPM * plant.pole_pairs * case.rpm, V_max())
+    problem = TransferProblem(
+        plant.R, plant.L_d, plant.L_q, plant.psi, RAD_S_PER_RPM * plant.pole_pairs * case.rpm, V_max()
+    )
     return minimum_time(problem, case.start, case.target, radius=BAND * case.size)
 
 
@@ -125,7 +127,7 @@ def nearest_held(case: Case, plant: Plant, limit_a: float, eps: float = 0.0) -> 
     Projection on ellipse and disc: on one of them where that lies in the other, else on a corner of the two. Where they
     have no common point the projection on the ellipse, the voltage goes first.
     """
-    w = RPM * plant.pole_pairs * case.rpm
+    w = RAD_S_PER_RPM * plant.pole_pairs * case.rpm
     M = np.array([[plant.R, -w * plant.L_q], [w * plant.L_d, plant.R]])
     c, r = np.array([0.0, w * plant.psi]), np.asarray(case.target)
     gram, pull = M.T @ M, M.T @ c

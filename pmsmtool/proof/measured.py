@@ -15,8 +15,9 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.drive.port import Drive, Injection
 from pmsmtool.errors import CheckFailed
 from pmsmtool.experiments.speed_run import reach
-from pmsmtool.proof.plan import RPM, Conditions, Experiment, ProofPlan
+from pmsmtool.proof.plan import Conditions, Experiment, ProofPlan
 from pmsmtool.trace import Trace
+from pmsmtool.units import RAD_S_PER_RPM
 
 REACH_S = 4.0
 REACH_FACTOR = 2.0
@@ -127,7 +128,7 @@ def _recorded(
         say(f"the record began {100.0 * off:+.2g} % off its speed" + ("; again" if left else ""))
     raise SpeedNotReached(
         f"the speed was not kept: {ATTEMPTS} times {experiment.name} began more than {-100.0 * KEPT[0]:g} % below "
-        f"{experiment.base_rad_s / RPM:.4g} rpm, or {100.0 * KEPT[1]:g} % above",
+        f"{experiment.base_rad_s / RAD_S_PER_RPM:.4g} rpm, or {100.0 * KEPT[1]:g} % above",
         likely="the shaft coasts too long while the bus or this computer is slow, or something brakes or drives it",
     )
 
@@ -151,7 +152,7 @@ def _refuse_other_speed(
     omega = state["omega_e_rad_s"]
     if abs(omega - omega_e_rad_s) <= REACHED * abs(omega_e_rad_s):
         return  # it only does not rest there
-    rpm = design.machine.machine.pole_pairs * RPM
+    rpm = design.machine.machine.pole_pairs * RAD_S_PER_RPM
     raise SpeedNotReached(
         f"the speed was not reached: {omega / rpm:.4g} of {omega_e_rad_s / rpm:.4g} rpm after {limit_s:.3g} s, with "
         f"i_d = {state['i_d_a']:.3g} A and i_q = {state['i_q_a']:.3g} A, before {experiment.name}",
@@ -181,7 +182,7 @@ def _approach(drive: Drive, speed_rad_s: float, pole_pairs: int) -> None:
     """Ask for a mechanical speed (rad/s) in small steps, up and down: full torque either way may be too much."""
     present = drive.live("omega_e_rad_s") / pole_pairs
     change = speed_rad_s - present
-    slope = RISE_SHARE * drive.read("speed.acceleration_rpm_per_s") * RPM
+    slope = RISE_SHARE * drive.read("speed.acceleration_rpm_per_s") * RAD_S_PER_RPM
     if present >= 0.0 and slope > 0.0:
         for k in range(1, RISE_STEPS):
             drive.command_speed(present + change * k / RISE_STEPS)
@@ -191,7 +192,7 @@ def _approach(drive: Drive, speed_rad_s: float, pole_pairs: int) -> None:
 
 def _ramp_s(drive: Drive, speed_rad_s: float, pole_pairs: int) -> float:
     """Time to allow for a mechanical speed (s): what a heavy shaft needs with the design's slope, and as much again."""
-    slope = drive.read("speed.acceleration_rpm_per_s") * RPM
+    slope = drive.read("speed.acceleration_rpm_per_s") * RAD_S_PER_RPM
     change = abs(speed_rad_s - drive.live("omega_e_rad_s") / pole_pairs)
     return REACH_FACTOR * change / slope if slope > 0.0 else 0.0
 

@@ -30,8 +30,6 @@ from pmsmtool.machine.uncontrolled_generation import STATED
 from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES
 from pmsmtool.units import RAD_S_PER_RPM
 
-RPM = RAD_S_PER_RPM
-
 SIGNALS = ("i_d_a", "i_q_a", "omega_e_rad_s", "u_d_lim_v", "u_q_lim_v")
 """What is recorded of every experiment but a move."""
 LINK, VOLTAGE_LIMITED = "U_dc_v", ("unreachable", "weakening")
@@ -306,8 +304,8 @@ class _Sizes:
         psi, L_q = machine.psi_f_wb, machine.L_q_decoupling_h
         p = machine.pole_pairs
         omega_max = p * min(
-            SPEED_SHARE * min(conditions.speed_max_rad_s, design["motor.n_max_rpm"] * RPM),
-            GENERATION_SHARE * _generation_rpm(design) * RPM,
+            SPEED_SHARE * min(conditions.speed_max_rad_s, design["motor.n_max_rpm"] * RAD_S_PER_RPM),
+            GENERATION_SHARE * _generation_rpm(design) * RAD_S_PER_RPM,
         )
         omega_base = V / math.hypot(psi, L_q * I_test)
         turns = conditions.shaft != "locked" and design["speed.K_p_nms_per_rad"] > 0.0
@@ -361,11 +359,11 @@ def _unmodelled(design: Design) -> str:
 
 
 def _speed_step(s: _Sizes) -> Experiment:
-    slope = s.design["speed.acceleration_rpm_per_s"] * RPM
+    slope = s.design["speed.acceleration_rpm_per_s"] * RAD_S_PER_RPM
     speed = min(s.omega_steps / s.p, slope * _longest_ramp_s(s))
     ramp_s = speed / slope
     rows, decimation = _record_of(s, ramp_s)
-    text = f"speed step from standstill to {speed / RPM:.4g} rpm"
+    text = f"speed step from standstill to {speed / RAD_S_PER_RPM:.4g} rpm"
     return Experiment("speed_step", text, 0.0, _speed_excitation(s, speed, rows, decimation), rows, decimation,
                       judged=("i_d_a", "i_q_a", "omega_e_rad_s"), scale_a=s.I_test,
                       scale_rad_s=s.p * speed, steady_rows=_steady_rows(s, ramp_s, rows, decimation))  # fmt: skip
@@ -418,7 +416,9 @@ def _current_steps(s: _Sizes, axis: str) -> Experiment:
         duration_s=rows * decimation * s.T_s, buffer=pattern,
     )  # fmt: skip
     speed = _apart(s.omega_steps, len(pattern) * decimation * s.T_s, repeats) / s.p
-    text = f"i_{axis} steps of +-{0.5 * step:.4g} and +-{step:.4g} A at {speed / RPM:.4g} rpm, {repeats} times"
+    text = (
+        f"i_{axis} steps of +-{0.5 * step:.4g} and +-{step:.4g} A at {speed / RAD_S_PER_RPM:.4g} rpm, {repeats} times"
+    )
     scale = max(step, SCALE_SHARE * s.I_test)
     return Experiment(f"{axis}_steps", text, speed, excitation, rows, decimation, repeats, scale_a=scale)
 
@@ -452,12 +452,13 @@ def _unreachable(s: _Sizes) -> Experiment | str:
     if UNREACHABLE_ROWS[0] * rise > min(UNREACHABLE_LARGEST_RISE * omega, s.omega_max - omega):
         return (
             f"unreachable reference: the shaft is too light, {current:.4g} A may speed it up by "
-            f"{UNREACHABLE_ROWS[0] * rise / s.p / RPM:.4g} rpm from {omega / s.p / RPM:.4g} rpm within the record"
+            f"{UNREACHABLE_ROWS[0] * rise / s.p / RAD_S_PER_RPM:.4g} rpm from "
+            f"{omega / s.p / RAD_S_PER_RPM:.4g} rpm within the record"
         )
     periods = UNREACHABLE_SPEED_RISE * omega / max(rise, 1e-30)
     rows = round(min(UNREACHABLE_ROWS[1], max(UNREACHABLE_ROWS[0], periods)))
     excitation = Excitation(Shape.STEP, Injection.I_Q, current, duration_s=rows * s.T_s)
-    speed = omega / s.p / RPM
+    speed = omega / s.p / RAD_S_PER_RPM
     text = f"i_q step to {current:.4g} A at {speed:.4g} rpm, for which the voltage does not suffice {when}"
     return Experiment("unreachable", text, omega / s.p, excitation, rows, 1, scale_a=current,
                       settle_s=SPEED_SETTLE / s.crossover_rad_s)  # fmt: skip
@@ -483,22 +484,22 @@ def _weakening(s: _Sizes) -> Experiment | str:
     i_d = max(-WEAKENING_CURRENT * s.i_lim, 0.8 * s.design["field_weakening.i_d_min_a"])
     psi_end = s.psi + s.L_d * i_d
     end = min(WEAKENING_END * corner, s.omega_max, s.V_weakening / psi_end if psi_end > 0.0 else math.inf)
-    slope = WEAKENING_SLOPE * s.design["speed.acceleration_rpm_per_s"] * RPM
+    slope = WEAKENING_SLOPE * s.design["speed.acceleration_rpm_per_s"] * RAD_S_PER_RPM
     span = s.p * slope * _longest_ramp_s(s)
     begin = min(max(WEAKENING_START * corner, end - span), WEAKENING_LATEST * corner)
     if end >= WEAKENING_LEAST * corner > begin + span:
         return (
-            f"entry into field weakening: the shaft takes more than {LONGEST_S:g} s from {begin / s.p / RPM:.4g} rpm "
-            f"to {WEAKENING_LEAST * corner / s.p / RPM:.4g} rpm"
+            f"entry into field weakening: the shaft takes more than {LONGEST_S:g} s from "
+            f"{begin / s.p / RAD_S_PER_RPM:.4g} rpm to {WEAKENING_LEAST * corner / s.p / RAD_S_PER_RPM:.4g} rpm"
         )
     end = min(end, begin + span)
     if end < WEAKENING_LEAST * corner:
         above = _generation_rpm(s.design)
-        bound = s.omega_max >= GENERATION_SHARE * above * RPM * s.p
+        bound = s.omega_max >= GENERATION_SHARE * above * RAD_S_PER_RPM * s.p
         why = f"; above {above:.4g} rpm a fault would charge the DC link (--overspeed-protection)" if bound else ""
         return (
-            f"entry into field weakening: it begins at {corner / s.p / RPM:.4g} rpm, "
-            f"{end / s.p / RPM:.4g} rpm are within the limits{why}"
+            f"entry into field weakening: it begins at {corner / s.p / RAD_S_PER_RPM:.4g} rpm, "
+            f"{end / s.p / RAD_S_PER_RPM:.4g} rpm are within the limits{why}"
         )
     start, step = begin / s.p, (end - begin) / s.p
     rows, decimation = _record_of(s, step / slope)
@@ -508,7 +509,7 @@ def _weakening(s: _Sizes) -> Experiment | str:
     # drive would brake with all its torque while the flux is weakened
     ramp = tuple(min(step, rise * k) for k in range(1, levels + 2))
     excitation = Excitation(Shape.BUFFER, Injection.SPEED, step, hold_periods=hold, buffer=(*ramp, *_back(ramp)))
-    text = f"speed ramp from {start / RPM:.4g} to {end / s.p / RPM:.4g} rpm, into field weakening"
+    text = f"speed ramp from {start / RAD_S_PER_RPM:.4g} to {end / s.p / RAD_S_PER_RPM:.4g} rpm, into field weakening"
     return Experiment("weakening", text, start, excitation, rows, decimation,
                       judged=("i_d_a", "i_q_a", "omega_e_rad_s"), scale_a=s.I_test, scale_rad_s=end,
                       settle_s=SPEED_SETTLE / s.crossover_rad_s,
@@ -517,7 +518,7 @@ def _weakening(s: _Sizes) -> Experiment | str:
 
 def _moves(s: _Sizes, increments: int) -> tuple[Experiment, ...] | str:
     """Return a move with the speed fed forward as designed, and its way back without: what K_p alone leaves shows."""
-    K_p, slope = s.design["position.K_p_per_s"], s.design["speed.acceleration_rpm_per_s"] * RPM
+    K_p, slope = s.design["position.K_p_per_s"], s.design["speed.acceleration_rpm_per_s"] * RAD_S_PER_RPM
     if K_p <= 0.0:
         return "position moves: the design has no position controller"
     if unmodelled := _unmodelled(s.design):
@@ -540,16 +541,16 @@ def _moves(s: _Sizes, increments: int) -> tuple[Experiment, ...] | str:
     jerk = min(acceleration / (ramp_s * unit), MOST_COUNTS)
     move = ProfileMove(0, round(speed / unit), max(1, round(acceleration / unit)), max(1, round(jerk)))
     if move.velocity < MOVE_LEAST_INCREMENTS / step_s:
-        return f"position moves: {increments} increments of a turn are too coarse for {speed / RPM:.4g} rpm"
+        return f"position moves: {increments} increments of a turn are too coarse for {speed / RAD_S_PER_RPM:.4g} rpm"
     rise_s, ramp_s = move.velocity / move.acceleration, move.acceleration / move.jerk
     at_speed_s = rise_s + ramp_s + MOVE_AT_SPEED / K_p
     move = replace(move, way=round(move.velocity * at_speed_s))
     if move.way > MOST_WAY:
-        return f"position moves: {increments} increments of a turn are too fine for {speed / RPM:.4g} rpm"
+        return f"position moves: {increments} increments of a turn are too fine for {speed / RAD_S_PER_RPM:.4g} rpm"
     moving_s, settling_s = at_speed_s + rise_s + ramp_s, MOVE_SETTLE / K_p + 0.5 * SPEED_SETTLE / s.crossover_rad_s
     decimation = max(1, math.ceil((moving_s + settling_s) / (SPEED_ROWS * s.T_s)))
     steady = max(0, SPEED_ROWS - math.ceil((moving_s + 0.5 * settling_s) / (decimation * s.T_s)))
-    turns = f"{move.way / increments:.4g} turns at {speed / RPM:.4g} rpm"
+    turns = f"{move.way / increments:.4g} turns at {speed / RAD_S_PER_RPM:.4g} rpm"
     nothing = Excitation(Shape.NONE, Injection.SPEED, 0.0)
     whole = Experiment(
         "move", f"move of {turns} by the position loop", 0.0, nothing, SPEED_ROWS, decimation, judged=MOVE_SIGNALS,

@@ -45,12 +45,13 @@ from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.proof.drawn_machine import SEEN_SHARES, U_DC_SPREAD
 from pmsmtool.proof.judgement import Judgement, judge, with_ripple
 from pmsmtool.proof.measured import SpeedNotReached, run_experiments
-from pmsmtool.proof.plan import LINK, RPM, Conditions, Experiment, ProofPlan, plan_proof
+from pmsmtool.proof.plan import LINK, Conditions, Experiment, ProofPlan, plan_proof
 from pmsmtool.proof.prediction_file import from_arrays, to_arrays
 from pmsmtool.proof.simulated import RUNS, averaged, predict_proof
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import read_trace, trace_npz
+from pmsmtool.units import RAD_S_PER_RPM
 
 FOLDER = "prove"
 PREDICTION = "prediction.npz"
@@ -144,13 +145,15 @@ def envelope_of(design: Design, request: ProofRequest, plan: ProofPlan | None = 
     On a supply that gives way less of both, so that a current at any speed leaves the DC link up: not less than what
     is rated, where the supply gives that.
     """
-    T_s, slope = design.machine.inverter.T_s, design["speed.acceleration_rpm_per_s"] * RPM
+    T_s, slope = design.machine.inverter.T_s, design["speed.acceleration_rpm_per_s"] * RAD_S_PER_RPM
     i_max = design["motor.I_max_apk"] if request.i_max_apk is None else request.i_max_apk
-    speed_max = design["motor.n_max_rpm"] * RPM if request.speed_max_rad_s is None else request.speed_max_rad_s
+    speed_max = (
+        design["motor.n_max_rpm"] * RAD_S_PER_RPM if request.speed_max_rad_s is None else request.speed_max_rad_s
+    )
     supply_w = design.machine.conditions.get(SUPPLY)
     if isinstance(supply_w, float):
         per_ampere = abs(design.machine.machine.torque_nm(0.0, 1.0))
-        i_nom, rated_rad_s = min(i_max, design["motor.I_nom_apk"]), min(speed_max, rated_rpm(design) * RPM)
+        i_nom, rated_rad_s = min(i_max, design["motor.I_nom_apk"]), min(speed_max, rated_rpm(design) * RAD_S_PER_RPM)
         if 0.0 < i_nom * rated_rad_s * per_ampere <= supply_w:  # what is rated can be proven
             i_max = max(i_nom, min(i_max, supply_w / (speed_max * per_ampere)))
             speed_max = min(speed_max, supply_w / (i_max * per_ampere))
@@ -227,7 +230,7 @@ def _beyond(design: Design, conditions: Conditions) -> list[str]:
     """Return what a proof within its envelope leaves open of the machine's ratings."""
     rows = (
         ("current", conditions.i_max_apk, design["motor.I_nom_apk"], "A pk"),
-        ("speed", conditions.speed_max_rad_s / RPM, rated_rpm(design), "rpm"),
+        ("speed", conditions.speed_max_rad_s / RAD_S_PER_RPM, rated_rpm(design), "rpm"),
     )
     supply_w = design.machine.conditions.get(SUPPLY)
     limit = f": the DC link gives way at {supply_w:.3g} W" if isinstance(supply_w, float) else ""

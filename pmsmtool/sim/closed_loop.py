@@ -19,13 +19,13 @@ from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import (
     RECORD_COMPENSATION,
     ROTORS,
-    RPM,
     build_setup,
     own_compensation,
     records_compensation,
     with_simulation,
 )
 from pmsmtool.trace import Trace
+from pmsmtool.units import RAD_S_PER_RPM
 
 ROWS_MAX = 20_000_000
 """Rows of a trace; more do not fit a memory that has other things to do (26 signals: 4 GB)."""
@@ -153,7 +153,9 @@ def open_simulation(
     """
     changed = ({"rotor": scenario.rotor} if scenario.rotor else {}) | dict(scenario.simulation)
     machine_file = with_simulation(machine_file, changed)
-    setup, keep = build_setup(machine_file, seed=seed, application=application, start_rad_s=RPM * scenario.start_rpm)
+    setup, keep = build_setup(
+        machine_file, seed=seed, application=application, start_rad_s=RAD_S_PER_RPM * scenario.start_rpm
+    )
     _check(machine_file, params, scenario, setup.machine.rotor)
     simulation = Simulation(setup, image_of(machine_file, params), keep)
     for name, profile in scenario.schedule.items():

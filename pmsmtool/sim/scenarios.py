@@ -16,8 +16,9 @@ from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.key import Key, Value, check_table, did_you_mean, not_numbers
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.sim.kernel import Target
-from pmsmtool.sim.simulated_machine import ROTORS, RPM
+from pmsmtool.sim.simulated_machine import ROTORS
 from pmsmtool.toml_file import read_toml
+from pmsmtool.units import RAD_S_PER_RPM
 
 NEXT_STEP = "`pmsmtool help scenario` lists the keys; `pmsmtool simulate --list` names what is built in"
 
@@ -51,11 +52,11 @@ SCHEDULES: dict[str, tuple[Target, float]] = {
     "i_d_a": (Target.I_D, 1.0),
     "i_q_a": (Target.I_Q, 1.0),
     "torque_nm": (Target.TORQUE, 1.0),
-    "speed_rpm": (Target.SPEED, RPM),
+    "speed_rpm": (Target.SPEED, RAD_S_PER_RPM),
     "u_d_v": (Target.U_D, 1.0),
     "u_q_v": (Target.U_Q, 1.0),
     "load_nm": (Target.LOAD, 1.0),
-    "driven_rpm": (Target.DRIVEN_SPEED, RPM),
+    "driven_rpm": (Target.DRIVEN_SPEED, RAD_S_PER_RPM),
     "U_dc_v": (Target.U_DC, 1.0),
 }
 """Names of a ``[schedule]``, what they move, and the factor to SI."""
@@ -223,11 +224,11 @@ def _scale(machine_file: MachineFile, values: Mapping[str, float]) -> _Scale:
     machine = machine_file.machine
     i_a = machine.I_nom_apk or values["motor.I_nom_apk"]
     psi = math.hypot(machine.psi_f_wb, machine.L_q_decoupling_h * i_a)
-    base_rpm = 0.9 * machine_file.inverter.V_max_v / (machine.pole_pairs * psi) / RPM
+    base_rpm = 0.9 * machine_file.inverter.V_max_v / (machine.pole_pairs * psi) / RAD_S_PER_RPM
     n_rpm = machine.n_nom_rpm or base_rpm
     psi_least = machine.psi_f_wb + machine.L_d_h * values["field_weakening.i_d_min_a"]
     V_m = (1.0 - values["field_weakening.margin"]) * machine_file.inverter.V_max_v
-    reached_rpm = V_m / (machine.pole_pairs * psi_least) / RPM if psi_least > 0.0 else math.inf
+    reached_rpm = V_m / (machine.pole_pairs * psi_least) / RAD_S_PER_RPM if psi_least > 0.0 else math.inf
     return _Scale(
         i_a=i_a,
         i_d_min_a=max(values["field_weakening.i_d_min_a"], -i_a),
@@ -277,7 +278,7 @@ def _ramp_time(scale: _Scale, speed_rpm: float) -> float:
     """Time that a third of the rated torque needs to a speed, 0.2 s to 5 s."""
     if not scale.J_kgm2 or not scale.torque_nm:
         return 1.0
-    return min(max(3.0 * scale.J_kgm2 * speed_rpm * RPM / scale.torque_nm, 0.2), 5.0)
+    return min(max(3.0 * scale.J_kgm2 * speed_rpm * RAD_S_PER_RPM / scale.torque_nm, 0.2), 5.0)
 
 
 def _speed_ramp(scale: _Scale, name: str) -> Scenario:

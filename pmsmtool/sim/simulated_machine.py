@@ -48,9 +48,6 @@ UNBALANCE_SHARE = 0.5
 WRONG_COMPENSATION = 1.4
 """Plateau of ``compensation = "wrong"`` over the right one."""
 
-RPM = RAD_S_PER_RPM
-"""rad/s per rpm."""
-
 
 class Settings:
     """The resolved ``[simulation]`` table with typed access."""
@@ -168,7 +165,7 @@ def build_setup(
     setup.T_winding, setup.T_magnet = settings.number("T_winding_c"), settings.number("T_magnet_c")
     setup.theta_M = settings.number("theta_M_start_rad")
     driven = setup.machine.rotor == Rotor.DRIVEN and start_rad_s == 0.0
-    setup.omega_M = RPM * settings.number("driven_rpm") if driven else start_rad_s
+    setup.omega_M = RAD_S_PER_RPM * settings.number("driven_rpm") if driven else start_rad_s
     setup.seed = settings.whole("seed") if seed is None else seed
     setup.application = application
     if violations:
@@ -231,7 +228,10 @@ def _mechanics(out: Any, settings: Settings, violations: list[str]) -> None:
     for of in ("slot", "pole"):
         setattr(out, f"cogging_{of}", settings.number(f"cogging_{of}_nm"))
         setattr(out, f"cogging_{of}_periods", float(settings.whole(f"cogging_{of}_periods")))
-    out.stribeck, out.stribeck_speed = settings.number("stribeck_share"), RPM * settings.number("stribeck_rpm")
+    out.stribeck, out.stribeck_speed = (
+        settings.number("stribeck_share"),
+        RAD_S_PER_RPM * settings.number("stribeck_rpm"),
+    )
     out.friction_once, out.backlash = settings.number("friction_once"), settings.number("backlash_rad")
     out.J_load = settings.number("J_load_kgm2")
     out.coupling_stiffness = settings.number("coupling_stiffness_nm_per_rad")

@@ -10,9 +10,10 @@ import pytest
 
 from benchmarks.analytic_saturation import BridgeSaturation
 from benchmarks.exact_points import WIDE, Tally, as_map, check_speed, random_machine, speeds
-from pmsmtool.design.lookup.table import RPM, LookupTable, speed_table, torque_limits
+from pmsmtool.design.lookup.table import LookupTable, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.machine.flux_map import FluxMap
+from pmsmtool.units import RPM_PER_RAD_S
 from tests.design.exact_points import LinearCase
 
 MACHINES = 14
@@ -97,7 +98,7 @@ def drawn(number: int) -> tuple[OperatingMachine, LinearCase, float]:
 
 def row(machine: OperatingMachine, case: LinearCase, omega: float, torque: np.ndarray) -> LookupTable:
     return speed_table(
-        machine, torque_nm=torque, speed_rpm=[omega / machine.pole_pairs * RPM], V_max_v=[case.V],
+        machine, torque_nm=torque, speed_rpm=[omega / machine.pole_pairs * RPM_PER_RAD_S], V_max_v=[case.V],
         I_max_apk=case.I_max, i_d_min_a=case.i_d_min,
     )  # fmt: skip
 

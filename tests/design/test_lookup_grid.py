@@ -30,7 +30,7 @@ from pmsmtool.design.lookup.grid import (
     table_words,
 )
 from pmsmtool.design.lookup.loci import loci
-from pmsmtool.design.lookup.table import CUT, RPM, LookupTable, electrical_speed, flux_table, speed_table, torque_limits
+from pmsmtool.design.lookup.table import CUT, LookupTable, electrical_speed, flux_table, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.tune import tune
@@ -44,6 +44,7 @@ from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.sim.closed_loop import image_of
+from pmsmtool.units import RPM_PER_RAD_S
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 M = OperatingMachine(4, 0.05, 1e-3, 2.5e-3, 0.1)
@@ -270,7 +271,7 @@ def test_flux_table_is_exact_without_resistance_and_says_how_far_off_it_is_with(
     torque = np.linspace(-120.0, 120.0, 7)
     over_flux = flux_table(lossless, torque_nm=torque, flux_limit_wb=flux, I_max_apk=150.0)
     for k, limit in enumerate(flux):
-        rpm = 100.0 / limit / M.pole_pairs * RPM
+        rpm = 100.0 / limit / M.pole_pairs * RPM_PER_RAD_S
         over_speed = speed_table(lossless, torque_nm=torque, speed_rpm=[rpm], V_max_v=[100.0], I_max_apk=150.0)
         assert np.allclose(over_flux.i_d_a[:, k, 0], over_speed.i_d_a[:, 0, 0], atol=1e-6)
         assert np.allclose(over_flux.i_q_a[:, k, 0], over_speed.i_q_a[:, 0, 0], atol=1e-6)

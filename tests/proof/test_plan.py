@@ -25,10 +25,11 @@ from pmsmtool.machine.torque import iron_drag
 from pmsmtool.machine.two_masses import INERTIA, PLAY_FACTOR, REFUSED, SWING, TORQUE_NOISE, UNSEEN
 from pmsmtool.proof.drawn_machine import EMF_HARMONICS, FRICTION_FACTOR, LAG_SHARES, LATE_SHARE
 from pmsmtool.proof.judgement import LEAST_STEADY_ROWS
-from pmsmtool.proof.plan import LONGEST_S, RPM, SIGNALS, STEPS, WEAKENING_SLOPE, Conditions, _apart, plan_proof
+from pmsmtool.proof.plan import LONGEST_S, SIGNALS, STEPS, WEAKENING_SLOPE, Conditions, _apart, plan_proof
 from pmsmtool.proof.simulated import BASE_SPEED, SimulatedDrives, as_tested
 from pmsmtool.proof.stage import ProofRequest, envelope_of
 from pmsmtool.resources import data_folder
+from pmsmtool.units import RAD_S_PER_RPM
 
 
 def design(name: str = "interior-2k2") -> Design:
@@ -37,7 +38,7 @@ def design(name: str = "interior-2k2") -> Design:
 
 def conditions(made: Design, **other: object) -> Conditions:
     U_dc, i_max = made.machine.inverter.U_dc_v, made["motor.I_max_apk"]
-    standard = Conditions(U_dc, 25.0, 25.0, 1 << 17, i_max, made["motor.n_max_rpm"] * RPM)
+    standard = Conditions(U_dc, 25.0, 25.0, 1 << 17, i_max, made["motor.n_max_rpm"] * RAD_S_PER_RPM)
     return replace(standard, **other)  # type: ignore[arg-type]
 
 
@@ -171,7 +172,7 @@ def test_a_move_fits_the_objects_of_the_drive(bits: int) -> None:
 def test_nothing_leaves_the_envelope(seed: int) -> None:
     made = tune(draw_drive(seed), TuneRequest(field_weakening="lookup"))
     allowed = conditions(
-        made, i_max_apk=0.6 * made["motor.I_max_apk"], speed_max_rad_s=0.7 * made["motor.n_max_rpm"] * RPM
+        made, i_max_apk=0.6 * made["motor.I_max_apk"], speed_max_rad_s=0.7 * made["motor.n_max_rpm"] * RAD_S_PER_RPM
     )
     V_max = made.machine.inverter.V_max_v
     for experiment in plan_proof(made, allowed).experiments:
@@ -199,7 +200,7 @@ def test_the_proof_stays_below_uncontrolled_generation_unless_a_fault_shorts_the
         close = replace(made, facts={**made.facts, "generation_rpm": limit_rpm})
         plan = plan_proof(close, conditions(close))
         reached = [e.base_rad_s + e.excitation.amplitude for e in plan.experiments if e.name == "weakening"]
-        assert bool(reached) == bounded and all(speed <= limit_rpm * RPM for speed in reached)
+        assert bool(reached) == bounded and all(speed <= limit_rpm * RAD_S_PER_RPM for speed in reached)
         if not bounded:
             assert any("above 1000 rpm a fault would charge the DC link" in line for line in plan.left_out)
         for taker in ("chopper", "battery"):
@@ -217,7 +218,7 @@ def test_a_record_of_a_speed_ends_behind_its_ramp_however_heavy_the_shaft(heavie
     made = design()
     made = changed(made, speed__acceleration_rpm_per_s=made["speed.acceleration_rpm_per_s"] / heavier)
     plan = plan_proof(made, conditions(made))
-    slope = made["speed.acceleration_rpm_per_s"] * RPM
+    slope = made["speed.acceleration_rpm_per_s"] * RAD_S_PER_RPM
     entries = {e.name: e for e in plan.experiments if e.excitation.point is Injection.SPEED and e.move is None}
     for e, steepness in ((entries["speed_step"], 1.0), (entries.get("weakening"), WEAKENING_SLOPE)):
         if e is None:
@@ -495,7 +496,7 @@ def test_zero_is_a_limit_and_not_the_absence_of_one() -> None:
     assert (nothing.i_max_apk, nothing.speed_max_rad_s) == (0.0, 0.0)
     free = envelope_of(made, ProofRequest())
     assert free.i_max_apk == made["motor.I_max_apk"]
-    assert free.speed_max_rad_s == pytest.approx(made["motor.n_max_rpm"] * RPM)
+    assert free.speed_max_rad_s == pytest.approx(made["motor.n_max_rpm"] * RAD_S_PER_RPM)
     with pytest.raises(NotAvailable):
         plan_proof(made, conditions(made, i_max_apk=0.0))
     plan = plan_proof(made, conditions(made, speed_max_rad_s=0.0))

@@ -41,7 +41,6 @@ from pmsmtool.proof import stage as stages
 from pmsmtool.proof.judgement import judge, with_ripple
 from pmsmtool.proof.plan import Conditions
 from pmsmtool.proof.stage import (
-    RPM,
     ProofRequest,
     _beyond,
     _too_slow,
@@ -54,6 +53,7 @@ from pmsmtool.proof.stage import (
 from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RECORD, RunDirectory, Stage
 from pmsmtool.sim.kernel import Params
+from pmsmtool.units import RAD_S_PER_RPM
 
 pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
 
@@ -255,12 +255,12 @@ def test_a_supply_that_gives_way_bounds_the_power_of_a_proof(design: Design) -> 
     assert usual.i_max_apk * usual.speed_max_rad_s * per_a > 2.0 * supply_w
     assert weak.i_max_apk * weak.speed_max_rad_s * per_a == pytest.approx(supply_w)
     assert weak.i_max_apk >= LEAST_CURRENT * usual.i_max_apk
-    rated_w = design["motor.I_nom_apk"] * rated_rpm(design) * RPM * per_a
+    rated_w = design["motor.I_nom_apk"] * rated_rpm(design) * RAD_S_PER_RPM * per_a
     for share in (1.05, 1.3, 1.8):  # what is rated is proven where the supply gives it
         conditions = {**design.machine.conditions, SUPPLY: share * rated_w}
         enough = envelope_of(replace(design, machine=replace(design.machine, conditions=conditions)), ProofRequest())
         assert enough.i_max_apk >= 0.999 * design["motor.I_nom_apk"]
-        assert enough.speed_max_rad_s >= 0.999 * rated_rpm(design) * RPM
+        assert enough.speed_max_rad_s >= 0.999 * rated_rpm(design) * RAD_S_PER_RPM
         assert enough.i_max_apk * enough.speed_max_rad_s * per_a == pytest.approx(share * rated_w)
     asked = ProofRequest(i_max_apk=1.0, speed_max_rad_s=50.0)
     assert envelope_of(replace(design, machine=machine), asked) == envelope_of(design, asked)
@@ -295,7 +295,7 @@ class Coasting:
         self.share, self.now_s = share, 0.0
 
     def read(self, name: str) -> float:
-        return 115.0 / measured.RPM
+        return 115.0 / RAD_S_PER_RPM
 
     def live(self, name: str) -> float:
         return max(0.0, 577.0 - 115.0 * self.share * self.now_s)

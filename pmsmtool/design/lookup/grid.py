@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
-from pmsmtool.design.lookup.table import RPM, LookupTable, torque_limits
+from pmsmtool.design.lookup.table import LookupTable, torque_limits
 from pmsmtool.design.operating_machine import design_library
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.params.catalogue import LUT_CAPACITY_WORDS
+from pmsmtool.units import RPM_PER_RAD_S
 
 StoredFormat = Literal["float32", "int16"]
 
@@ -103,7 +104,7 @@ def cell_errors(table: LookupTable, points: int = POINTS_PER_INTERVAL) -> Array:
     """
     worst = np.empty((table.torque_nm.size - 1, table.y.size - 1, 3, 3))
     speed = table.axis_kind == "speed"
-    per_y = ctypes.c_double(table.machine.pole_pairs / RPM)
+    per_y = ctypes.c_double(table.machine.pole_pairs / RPM_PER_RAD_S)
     plane = table.machine.as_struct(table.I_max_apk, table.i_d_min_a)
     if not speed:
         plane.R = 0.0
@@ -133,7 +134,7 @@ def _fine_limits(table: LookupTable, points: int) -> Array:
     if table.axis_kind == "flux":
         bounds = torque_limits(replace(table.machine, R=0.0), [1.0], y, table.I_max_apk, table.i_d_min_a)
         return np.ascontiguousarray(np.stack((bounds.least_nm.T, bounds.largest_nm.T), axis=-1))
-    omega = y * table.machine.pole_pairs / RPM
+    omega = y * table.machine.pole_pairs / RPM_PER_RAD_S
     bounds = torque_limits(table.machine, omega, _fine(table.V_max_v, points), table.I_max_apk, table.i_d_min_a)
     return np.ascontiguousarray(np.stack((bounds.least_nm, bounds.largest_nm), axis=-1))
 
@@ -243,7 +244,7 @@ def _split_voltages(table: LookupTable, axes: Axes, bounds: GridBounds) -> Axes 
 def _voltage_excess(table: LookupTable, bounds: GridBounds) -> list[float]:
     """Largest error inside each interval of the voltages at the nodes of torque and speed, over what is asked."""
     found = []
-    omega = table.y * table.machine.pole_pairs / RPM
+    omega = table.y * table.machine.pole_pairs / RPM_PER_RAD_S
     for k in range(table.U_dc_v.size - 1):
         i_d, i_q = (
             currents[..., k, None] * (1.0 - _BETWEEN) + currents[..., k + 1, None] * _BETWEEN

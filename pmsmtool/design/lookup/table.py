@@ -26,8 +26,6 @@ AxisKind = Literal["speed", "flux"]
 CURRENT, VOLTAGE, DEMAGNETISATION, MAP, CUT, NONE = 1, 2, 4, 8, 16, 32
 """Bits of a cell's limits (``enum pmsm_limit``)."""
 
-RPM = RPM_PER_RAD_S
-"""rpm per rad/s."""
 
 _NAMES = ((CURRENT, "current"), (VOLTAGE, "voltage"), (DEMAGNETISATION, "demagnetisation"), (MAP, "map"))
 
@@ -152,7 +150,7 @@ class LookupTable:
 
 def electrical_speed(machine: OperatingMachine, speed_rpm: ArrayLike) -> Array:
     """Return the electrical angular speed (rad/s) of mechanical speeds (rpm)."""
-    return np.asarray(speed_rpm, dtype=np.float64) * machine.pole_pairs / RPM
+    return np.asarray(speed_rpm, dtype=np.float64) * machine.pole_pairs / RPM_PER_RAD_S
 
 
 def _demand(table: LookupTable, i_d: Array, i_q: Array) -> tuple[Array, Array]:
