@@ -22,7 +22,7 @@ from typing import Any
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY, LUT_CAPACITY_WORDS, SATURATION_VALUES
-from pmsmtool.toml_file import parse_toml, toml_text
+from pmsmtool.toml_file import LARGEST_WHOLE, parse_toml, toml_text
 
 NEXT_STEP = (
     "`pmsmtool tune` and `pmsmtool export` write such a file; `pmsmtool param help NAME` shows a parameter's bounds"
@@ -38,8 +38,6 @@ SATURATION = "saturation.nodes"
 
 TABLE_NAMES = (*LUT_NAMES, SATURATION)
 """Every table, in the order of the parameter image."""
-
-_INTEGER_LIMIT = 2**64
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +153,7 @@ def default_set() -> ParameterSet:
 
 def _plain(name: str, value: float) -> float | int:
     """Return an integer parameter as an integer; violations of that stay visible as floats."""
-    whole = BY_NAME[name].is_integer and abs(value) < _INTEGER_LIMIT and value == int(value)
+    whole = BY_NAME[name].is_integer and abs(value) < LARGEST_WHOLE and value == int(value)
     return int(value) if whole else value
 
 
@@ -186,8 +184,7 @@ def _read_groups(document: Mapping[str, Any]) -> tuple[dict[str, float], dict[st
 
 
 def _is_number(value: object) -> bool:
-    # TOML knows integers of any length, binary64 does not.
-    return isinstance(value, float) or (type(value) is int and abs(value) < _INTEGER_LIMIT)
+    return type(value) in (int, float)  # a truth value is an int, too
 
 
 def to_binary32(value: float) -> float:
