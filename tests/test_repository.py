@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import tomllib
 from pathlib import Path
@@ -76,3 +77,16 @@ def test_every_source_names_its_licence() -> None:
     heads = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8")[:200] for path in sources}
     assert len(heads) > 700
     assert [name for name, head in heads.items() if "SPDX-License-Identifier: MIT" not in head] == []
+
+
+def runs_before_its_end(text: str) -> bool:
+    """Whether a module that is run as a program starts before all of its names are there."""
+    body = ast.parse(text).body
+    return any(isinstance(node, ast.If) and "__name__" in ast.unparse(node.test) for node in body[:-1])
+
+
+def test_a_program_starts_at_the_end_of_its_module() -> None:
+    programs = [path for path in SOURCES if path.suffix == ".py" and "__main__" in path.read_text(encoding="utf-8")]
+    assert len(programs) > 30
+    assert [str(path) for path in programs if runs_before_its_end(path.read_text(encoding="utf-8"))] == []
+    assert runs_before_its_end('if __name__ == "__main__":\n    main()\n\ndef main(): ...\n')

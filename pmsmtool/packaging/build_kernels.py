@@ -68,31 +68,6 @@ def build_all(
     return libraries
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Build into ``pmsmtool/_native``; warnings are errors; one kernel's errors do not keep the others back."""
-    names = [kernel.name for kernel in (*KERNELS, PAGE_SOURCES)]
-    parser = argparse.ArgumentParser(description="Compile the kernels of this checkout into pmsmtool/_native.")
-    parser.add_argument("kernel", nargs="*", help=f"which ones; default all of {', '.join(names)}")
-    parser.add_argument("--force", action="store_true", help="compile also what is up to date")
-    options = parser.parse_args(argv)
-    if unknown := sorted({*options.kernel} - {*names}):
-        parser.error(f"no such kernel: {', '.join(unknown)}")
-    failed = 0
-    for kernel in (row for row in KERNELS if not options.kernel or row.name in options.kernel):
-        try:
-            build_all(PACKAGE, LIBRARY_FOLDER, build_compiler(), strict=True, force=options.force, kernels=(kernel,))
-        except CompilerError as error:
-            print(error, file=sys.stderr)
-            failed = 1
-    if not options.kernel or PAGE_SOURCES.name in options.kernel:
-        build_page_module(PACKAGE, LIBRARY_FOLDER, force=options.force)
-    return failed
-
-
-if __name__ == "__main__":
-    sys.exit(main())
-
-
 def build_page_module(package: Path, folder: Path, *, strict: bool = False, force: bool = False) -> list[Path]:
     """Compile the module into ``folder`` and return it in a list.
 
@@ -125,3 +100,28 @@ def _compile(package: Path, module: Path) -> None:
         run_compiler(compiler, [*arguments, "-o", str(output)], package, f"{compiler.name}: {module.name}")
         os.replace(output, module)
     print(f"{module.name}: compiled by {compiler.name}", file=sys.stderr)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Build into ``pmsmtool/_native``; warnings are errors; one kernel's errors do not keep the others back."""
+    names = [kernel.name for kernel in (*KERNELS, PAGE_SOURCES)]
+    parser = argparse.ArgumentParser(description="Compile the kernels of this checkout into pmsmtool/_native.")
+    parser.add_argument("kernel", nargs="*", help=f"which ones; default all of {', '.join(names)}")
+    parser.add_argument("--force", action="store_true", help="compile also what is up to date")
+    options = parser.parse_args(argv)
+    if unknown := sorted({*options.kernel} - {*names}):
+        parser.error(f"no such kernel: {', '.join(unknown)}")
+    failed = 0
+    for kernel in (row for row in KERNELS if not options.kernel or row.name in options.kernel):
+        try:
+            build_all(PACKAGE, LIBRARY_FOLDER, build_compiler(), strict=True, force=options.force, kernels=(kernel,))
+        except CompilerError as error:
+            print(error, file=sys.stderr)
+            failed = 1
+    if not options.kernel or PAGE_SOURCES.name in options.kernel:
+        build_page_module(PACKAGE, LIBRARY_FOLDER, force=options.force)
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main())
