@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Random CAN frames and damaged files, at the tool and at the drive: no crash, no hang, no error that is not ours.
 
-Run from the repository: ``python benchmarks/fuzz.py [N] [NAME...]`` (default 100 000 of each). Seeds are fixed, so
+Run from the repository: ``python -m benchmarks.fuzz [N] [NAME...]`` (default 100 000 of each). Seeds are fixed, so
 that a failure comes again. Files are damaged in their text, or, where they are binary, in their bytes. Each input may
 take ``LONGEST_S`` and ``LARGEST_BYTES`` of memory.
 """
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import random
 import resource
 import signal
-import sys
 import tempfile
 import time
 import warnings
@@ -25,8 +25,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from pmsmtool.commissioning.report_page import report_page
 from pmsmtool.design.design_file import design_text, parse_design
@@ -364,9 +362,15 @@ def limit_memory() -> None:
 
 def main() -> None:
     """Print how the inputs ended."""
-    count = int(sys.argv[1]) if len(sys.argv) > 1 else 100_000
-    names = sys.argv[2:] or ["frames-at-the-tool", "frames-at-the-drive", *TEXTS, *BINARIES]
-    for name in names:
+    known = ["frames-at-the-tool", "frames-at-the-drive", *TEXTS, *BINARIES]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("count", nargs="?", type=int, default=100_000)
+    parser.add_argument("name", nargs="*", help=f"which; default all of {', '.join(known)}")
+    asked = parser.parse_args()
+    count = asked.count
+    if unknown := sorted({*asked.name} - {*known}):
+        parser.error(f"no such input: {', '.join(unknown)}")
+    for name in asked.name or known:
         if name == "frames-at-the-tool":
             _at_the_tool(count)
         elif name == "frames-at-the-drive":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A drive and a socketcand server that do anything: every reading command and ``stop`` against random behaviours.
 
-Run from the repository: ``python benchmarks/hostile_server.py [N] [FIRST] [PROCESSES]`` (default 500 behaviours from
+Run from the repository: ``python -m benchmarks.hostile_server [N] [FIRST] [PROCESSES]`` (default 500 behaviours from
 seed 0 in 4 processes). A behaviour is drawn from its seed: how the server greets, whether the drive falls silent,
 drops, delays, doubles or damages frames, how long its objects and names are and what stands in them. Counted are
 commands that take longer than they may, tracebacks (exit 70), control characters on the terminal, and stops that end
@@ -10,6 +10,7 @@ otherwise than with 0, 8, or 3 where no adapter opened. Exit code 1 says that so
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import json
@@ -26,8 +27,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
-
-sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from pmsmtool.cli.drive_access import LOOKING_S, WHOLE_SET_S
 from pmsmtool.cli.main import run
@@ -384,7 +383,11 @@ def _work(seeds: list[int], results: multiprocessing.Queue[tuple[int, tuple[str,
 
 def main() -> int:
     """Print what was found; 1 when something was."""
-    count, first, processes = (int(word) for word in (*sys.argv[1:], *("500", "0", "4")[len(sys.argv) - 1 :]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, default in (("count", 500), ("first", 0), ("processes", 4)):
+        parser.add_argument(name, nargs="?", type=int, default=default)
+    asked = parser.parse_args()
+    count, first, processes = asked.count, asked.first, asked.processes
     context = multiprocessing.get_context("spawn")
     results: multiprocessing.Queue[tuple[int, tuple[str, ...], str, float, str]] = context.Queue()
     seeds = range(first, first + count)

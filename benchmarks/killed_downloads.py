@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Kill ``pmsmtool flash-params`` with SIGKILL at random moments, over a bus to a drive in another process.
 
-Run from the repository: ``python benchmarks/killed_downloads.py [N]`` (default 50). Each run asserts that the drive
+Run from the repository: ``python -m benchmarks.killed_downloads [N]`` (default 50). Each run asserts that the drive
 works with exactly the old or exactly the new set and reports its CRC-32, and that the same command or ``restore``
 finishes.
 """
 
 from __future__ import annotations
 
+import argparse
 import random
-import sys
 import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from tests.drive.served import serving
 from tests.flash.rig import with_tables
@@ -24,7 +22,9 @@ from tests.flash.test_killed import OTHER, kill_and_recover
 
 def main() -> None:
     """Print what the drives held."""
-    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 50
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="?", type=int, default=50)
+    runs = parser.parse_args().runs
     rng = random.Random(1)
     found: Counter[str] = Counter()
     started = time.perf_counter()

@@ -1,21 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Downloads of the full set with 16 KiB of tables, and uploads of 64 KiB traces, under frame loss.
 
-Run from the repository: ``python benchmarks/loss.py [N]`` (default 200 of each). Every download that reports success is
+Run from the repository: ``python -m benchmarks.loss [N]`` (default 200 of each). Every download that reports success is
 compared with the drive's memory behind the tool's back, every trace with the drive's own bytes; one that fails must
 leave the old set. Anything else raises.
 """
 
 from __future__ import annotations
 
+import argparse
 import logging
-import sys
 import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from pmsmtool.bus.connect import Connection
 from pmsmtool.bus.sdo import Mode, SdoChannel
@@ -107,7 +105,9 @@ def uploads(share: float, runs: int) -> tuple[Counter[str], int, float]:
 def main() -> None:
     """Print one line per loss and kind."""
     logging.disable(logging.CRITICAL)
-    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 200
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", nargs="?", type=int, default=200)
+    runs = parser.parse_args().runs
     for share in (0.001, 0.01):
         for name, job in (
             ("downloads of the full set with 16 KiB of tables", downloads),

@@ -9,12 +9,12 @@ the session of the README the pictures in docs/pictures are made: the terminal, 
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import os
 import re
 import shlex
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from html import escape, unescape
@@ -173,10 +173,13 @@ def report_figure(page: str, caption: str) -> str:
     raise ValueError(f"the report has no figure {caption!r}")
 
 
-def main(names: Sequence[str]) -> None:
+def main() -> None:
     """Record pages; with README.md the pictures, too."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("page", nargs="*", type=Path, help="default: README.md and all of docs/")
+    names: list[Path] = parser.parse_args().page
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
-    for page in [Path(name).resolve() for name in names] or pages():
+    for page in [name.resolve() for name in names] or pages():
         folder = tempfile.mkdtemp()
         os.environ["PMSMTOOL_HOME"] = folder
         os.chdir(folder)
@@ -191,4 +194,4 @@ def main(names: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """A served drive among clients that vanish, flood it or never read: time of its answers, memory of the server.
 
-Run from the repository: ``python benchmarks/serve_soak.py [CLIENTS [FRAMES [SECONDS]]]`` (default 10 000 vanishing
+Run from the repository: ``python -m benchmarks.serve_soak [CLIENTS [FRAMES [SECONDS]]]`` (default 10 000 vanishing
 clients, a flood of 1 000 000 frames, 600 s of both). One client reads 0x1000 all the while.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import itertools
 import json
@@ -145,7 +146,11 @@ def soak(clients: int, frames: int, seconds: float = 0.0, seed: int = 17) -> Soa
 
 def main() -> int:
     """Print what was seen; 1 when it is beyond the limits."""
-    clients, frames, seconds = (int(given) for given in (*sys.argv[1:4], *map(str, DEFAULTS[len(sys.argv) - 1 :])))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, default in zip(("clients", "frames", "seconds"), DEFAULTS, strict=True):
+        parser.add_argument(name, nargs="?", type=int, default=default)
+    asked = parser.parse_args()
+    clients, frames, seconds = asked.clients, asked.frames, asked.seconds
     started = time.perf_counter()
     seen = soak(clients, frames, seconds)
     print(

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: MIT
 """Two tools write to one drive at the same time: one wins, the other is told who.
 
-Run from the repository: ``python benchmarks/two_tools.py [N] [SEED]`` (default 50 races). The drive is served by
+Run from the repository: ``python -m benchmarks.two_tools [N] [SEED]`` (default 50 races). The drive is served by
 another process; the second tool starts up to 0.6 s after the first. With the node named, and without.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import random
@@ -16,8 +17,6 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from tests.drive.served import Server, serving
 
@@ -52,8 +51,11 @@ def race(server: Server, home: Path, number: int, rng: random.Random) -> str:
 
 def main() -> int:
     """Print how the races ended; 1 when one did otherwise than it must."""
-    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 50
-    rng = random.Random(int(sys.argv[2]) if len(sys.argv) > 2 else 1)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, default in (("runs", 50), ("seed", 1)):
+        parser.add_argument(name, nargs="?", type=int, default=default)
+    asked = parser.parse_args()
+    runs, rng = asked.runs, random.Random(asked.seed)
     with tempfile.TemporaryDirectory() as home, serving("--nv", ":memory:") as server:
         ended = Counter(race(server, Path(home), number, rng) for number in range(runs))
     print(f"{runs} races: {dict(ended)}")
