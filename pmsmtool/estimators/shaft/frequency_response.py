@@ -19,14 +19,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array, Complex
-from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, information_bound, scaled_covariance
+from pmsmtool.estimators.estimate import (
+    CHI2_REFUSE,
+    COVERAGE_FACTOR,
+    SensorTolerance,
+    information_bound,
+    scaled_covariance,
+)
 from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt
 from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, STAGE, local_polynomials, transforms, without_noise
 from pmsmtool.machine.parameters import Estimate
@@ -95,7 +101,8 @@ class FrequencyResponse:
         Why a second mass is claimed, or is not.
     inertia : Estimate or None
         All that turns, of the model that explains the response: 1/J of a rigid shaft, the low-frequency end
-        J_M w_r^2/w_a^2 of two masses (kg m2); None where neither explains it.
+        J_M w_r^2/w_a^2 of two masses (kg m2); None where neither explains it. Its interval holds both where two masses
+        explain more and are not claimed.
     shown_hz : float
         Up to where a small second mass would have shown, where none is found (Hz); 0: nowhere.
     """
@@ -218,12 +225,14 @@ def _judged(
     gain = (without - two.cost) / max(1.0, chi2) - terms * penalty
     estimates = _estimates(two, chi2)
     against = _against(two, chi2, gain, estimates, frequency)
+    both = _inertia(two, chi2, (-1.0, 0.0, 2.0, 0.0, -2.0, 0.0), *scale)
     if against:
+        if one is not None and both is not None and gain > INFORMATION_GAIN:  # not claimed, but no rigid shaft either
+            one = replace(both, std=math.hypot(both.std, abs(both.value - one.value) / COVERAGE_FACTOR))
         reason = f"no resonance found up to {highest:.3g} Hz: {against}; {shown}"
         return FrequencyResponse(*facts, chi2, gain, reason=reason, inertia=one, shown_hz=to_hz), lines, rigid
     resonance, antiresonance = estimates["resonance_hz"].value, estimates["antiresonance_hz"].value
     reason = f"two masses, J_load/J_motor {(resonance / antiresonance) ** 2 - 1.0:.3g}, over {highest:.3g} Hz"
-    both = _inertia(two, chi2, (-1.0, 0.0, 2.0, 0.0, -2.0, 0.0), *scale)
     return FrequencyResponse(*facts, chi2, gain, estimates, reason, both), lines, rigid
 
 
