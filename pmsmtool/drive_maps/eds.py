@@ -21,17 +21,29 @@ UNSIGNED8, REAL32, REAL64, VISIBLE_STRING, OCTET_STRING, UNICODE_STRING, DOMAIN 
 INTEGER_BITS = {row.code: 8 * row.size for row in DATA_TYPES.values() if row.is_integer}
 SIGNED = frozenset(row.code for row in DATA_TYPES.values() if row.is_signed)
 _VAR, _DOMAIN_OBJECT = 0x07, 0x02
-_HAVE_SUBS = frozenset({0x06, 0x08, 0x09})  # DEFSTRUCT, ARRAY, RECORD
+_HAVE_SUBS: Container[object] = frozenset({0x06, 0x08, 0x09})  # DEFSTRUCT, ARRAY, RECORD
 
 _SECTION = re.compile(r"\s*\[([^\]]*)\]?\s*(?:;.*)?$")
 _OBJECT = re.compile(r"(?:0x)?([0-9A-F]{1,4})(?:[ _]*sub[ _]*([0-9A-F]{1,2}))?\Z", re.IGNORECASE)
-_REMARK = re.compile(r"[;#]|//")
+_REMARK = re.compile(r";|//|(?<!16)#|#(?![0-9A-Fa-f])")
+"""But ``16#1F`` is the number 0x1F, as IEC 61131-3 writes it."""
+_HEX = re.compile(r"(-?)(?:0x|16#)([0-9a-f]+)u?l{0,2}|(-?)([0-9][0-9a-f]*)h", re.IGNORECASE)
+_WHOLE = re.compile(r"([+-]?[0-9]+)\.0*")
+"""A whole number with a decimal point behind it."""
+LAST_NODE_ID = 127
 OCTAL = re.compile("0[0-7]+")
 """As C writes it; makers rather fill decimal numbers up with zeros."""
-_NODE_ID = re.compile(r"\$NODEID", re.IGNORECASE)
+NODE_ID_WORD = re.compile(r"\$(?:MY_)?NODE_?ID", re.IGNORECASE)
+"""Name of the node id in a number; one maker's files spell it otherwise."""
 _ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
 _WORDED = {"readwrite": "rw", "read": "ro", "readonly": "ro", "write": "wo", "writeonly": "wo", "constant": "const"}
 _NOT_LETTERS = re.compile(r"[^a-z]")
+OTHER_FILES = {
+    b"<": "a device description in XML (XDD, XDC, ESI), or a page of the web, is no EDS or DCF",
+    b"PK": "the file is an archive: the EDS or DCF is in it",
+    b"%PDF": "the file is a document",
+}
+"""What a file is that begins so and holds no object of an EDS."""
 COMMISSIONING = ("devicecomissioning", "devicecommissioning")
 """The standard's own spelling and the right one."""
 
@@ -108,17 +120,21 @@ def without_remark(text: str) -> str:
 def parse_integer(text: str, node_id: int | None = None) -> int:
     """Return an integer as data sheets write it: decimal, hex, with leading zeros, ``$NODEID+0x600``, with a remark.
 
+    Also as other tools do: ``16#1F``, ``1Fh``, ``0x1Full``, ``31.0``, ``(0x600 + $NODEID)``.
+
     Raises ValueError: if it is none of these.
     """
     total = 0
-    for part in without_remark(text).replace(" ", "").replace("\t", "").split("+"):
-        if _NODE_ID.fullmatch(part):
+    for part in without_remark(text).replace(" ", "").replace("\t", "").strip("()").split("+"):
+        if NODE_ID_WORD.fullmatch(part):
             if node_id is None:
                 raise ValueError("depends on the node id")
             total += node_id
-        elif part.lower().startswith(("0x", "-0x")):
-            total += int(part, 16)
+        elif found := _HEX.fullmatch(part):
+            total += int("".join(filter(None, found.groups())), 16)
         else:
+            whole = _WHOLE.fullmatch(part)
+            part = part if whole is None else whole.group(1)
             total += int(part.lstrip("0") or "0") if not part.startswith("-") else int(part)
     return total
 
@@ -141,20 +157,32 @@ def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Ed
     info = sections.get("deviceinfo", Section("", 0))
     stated = next((sections[name].get("nodeid") for name in COMMISSIONING if name in sections), "")
     node = _number(stated, None, f"{where}: NodeID", warnings)
+    if isinstance(node, int) and not 1 <= node <= LAST_NODE_ID:  # 255: none was given yet (CiA 305)
+        warnings.append(f"{where}: NodeID {node} is none of 1..{LAST_NODE_ID}, left out")
+        node = None
     node = node if isinstance(node, int) else node_id
     objects: dict[tuple[int, int], EdsObject] = {}
-    addresses = [object_of(name) for name in sections]
-    records = {address[0] for address in addresses if address is not None and address[1] is not None}
+    heads: dict[int, Section] = {}
+    records: set[int] = set()
     for section in sections.values():
-        for entry in _objects_of(section, sections, records, node, where, warnings):
+        address = object_of(section.name)
+        if address is not None and address[1] is None:
+            heads[address[0]] = section
+        elif address is not None and section.get("datatype"):
+            records.add(address[0])
+    for section in sections.values():
+        for entry in _objects_of(section, sections, heads, records, node, where, warnings):
             objects.setdefault((entry.index, entry.sub), entry)
     if not objects:
+        likely = next(
+            (what for mark, what in OTHER_FILES.items() if data.lstrip(b"\xef\xbb\xbf \r\n").startswith(mark)), ""
+        )
         raise ConfigError(
             "no object dictionary entries",
             where=where,
-            likely="this is not an EDS or DCF file",
+            likely=likely or "this is not an EDS or DCF file",
             hint="give the file that the drive's vendor calls EDS or DCF",
-            violations=warnings[:20],
+            violations=[] if likely else warnings[:20],
         )
 
     def identity(key: str) -> int | None:
@@ -216,8 +244,8 @@ def _sections(text: str, where: str, warnings: list[str]) -> dict[str, Section]:
 
 
 def _objects_of(
-    section: Section, sections: dict[str, Section], records: Container[int], node: int | None, where: str,
-    warnings: list[str],
+    section: Section, sections: dict[str, Section], heads: dict[int, Section], records: Container[int],
+    node: int | None, where: str, warnings: list[str],
 ) -> Iterator[EdsObject]:  # fmt: skip
     address = object_of(section.name)
     if address is None:
@@ -232,8 +260,15 @@ def _objects_of(
         return
     if sub is None and index in records:
         return  # the head of a record, whatever it calls itself
-    if sub is not None and f"{index:04x}" not in sections and f"{index:x}" not in sections:
+    head = heads.get(index)
+    if head is None:
         warnings.append(f"{place}sub{sub:X}: its object has no section, accepted")
+    elif sub is not None and head.get("datatype") and not section.get("datatype"):
+        compound = _number(head.get("objecttype"), None, place, [])
+        if index not in records and compound not in _HAVE_SUBS:
+            return  # says nothing; the object itself is described
+        if sub:
+            section.entries["datatype"] = head.entries["datatype"]  # an array's, said once
     yield _entry(section, index, sub or 0, section.get("parametername"), kind, node, place, warnings)
 
 
@@ -288,6 +323,8 @@ def _entry(
         text = section.get(key)
         if data_type in INTEGER_BITS and OCTAL.fullmatch(text) and int(text) != int(text, 8):
             warnings.append(f"{place}sub{sub:X} {key}: {text} is taken for a decimal; an octal one is {int(text, 8)}")
+        elif data_type in INTEGER_BITS and key.endswith("value"):
+            _number(text, data_type, f"{place}sub{sub:X} {key}", warnings, node)  # says what is no number
     return EdsObject(
         index,
         sub,

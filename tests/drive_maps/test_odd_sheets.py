@@ -128,3 +128,67 @@ def test_how_odd_lines_are_read_is_told(tmp_path: Path) -> None:
     path.write_text(path.read_text("ascii") + 5 * "[6075]\nDefaultValue=9000\n", encoding="ascii")
     told = assumptions_of(str(path))
     assert "section [6075] stands twice, merged" in told[0] and told[3].startswith("and ")
+
+
+@pytest.mark.parametrize(
+    "text", ["16#1F0", "1F0h", "0x1F0ull", "0x1f0UL", "496.0", "496.", "(0x1F0)", "16#1F0 # a remark"]
+)
+def test_a_number_in_the_notations_of_other_tools(text: str) -> None:
+    """``16#1F0`` was 16 without a word, as ``#`` begins a remark; the others were left out."""
+    assert parse_integer(text) == 0x1F0
+
+
+def test_the_node_id_in_brackets_or_by_its_other_name() -> None:
+    assert parse_integer("(0x600 + $NODEID)", 5) == parse_integer("$MY_NODE_ID+0x600", 5) == 0x605
+
+
+@pytest.mark.parametrize("text", ["0", "255", "300"])
+def test_a_node_id_that_no_node_has_moves_no_value(text: str) -> None:
+    """255 is a file whose node was given no id yet."""
+    sheet = parse_eds(f"[1400sub1]\nDataType=7\nAccessType=rw\n[DeviceComissioning]\nNodeID={text}\n".encode(), "x", 5)
+    assert sheet.node_id == 5
+    assert f"NodeID {text} is none of 1..127" in sheet.warnings[0]
+
+
+def test_a_value_that_is_no_number_is_told_and_blank(tmp_path: Path) -> None:
+    """The simulated drive held 0 there: a PDO went out under the identifier of the NMT commands."""
+    rows = [(*row[:4], "$NODEID|0x180" if row[0] == 0x6075 else row[4]) for row in unknown()]
+    path = write_eds(tmp_path / "x.eds", rows)
+    assert "6075sub0 defaultvalue: '$NODEID|0x180' is not a number, left out" in assumptions_of(str(path))[0]
+    assert read_makers_objects(str(path)).rows[0x6075, 0].default == ""
+
+
+def test_a_section_that_says_nothing_hides_no_object(tmp_path: Path) -> None:
+    """A variable with an empty section of a sub-index beside it was read-only bytes then."""
+    path = write_eds(tmp_path / "x.eds", unknown())
+    plain = parse_eds(path.read_bytes()).objects[0x6075, 0]
+    odd = parse_eds(path.read_bytes() + b"\n[6075sub0]\nSubNumber=1\n")
+    assert odd.objects[0x6075, 0] == plain
+    assert not odd.warnings
+
+
+def test_an_array_that_states_its_type_once() -> None:
+    head = "[2001]\nObjectType=8\nDataType=0x0006\nSubNumber=2\n[2001sub0]\nDataType=5\nAccessType=ro\n"
+    sheet = parse_eds(f"{head}[2001sub1]\nAccessType=rw\nHighLimit=7\n".encode())
+    entry = sheet.objects[0x2001, 1]
+    assert (entry.data_type, entry.high) == (6, 7)
+    assert not sheet.warnings
+
+
+@pytest.mark.parametrize(
+    ("data", "word"),
+    [(b'\xef\xbb\xbf<?xml version="1.0"?>\n<X/>', "XML"), (b"PK\x03\x04", "archive"), (b"%PDF-1.7", "document")],
+)
+def test_a_file_of_another_kind_is_named(data: bytes, word: str) -> None:
+    """A maker offers XDD, ESI, a manual and archives beside the EDS; the lines of the wrong one were listed."""
+    with pytest.raises(ConfigError, match="no object dictionary entries") as refused:
+        parse_eds(data, "x.xdd")
+    assert word in str(refused.value)
+    assert "not understood" not in str(refused.value)
+
+
+def test_a_mark_of_tables_in_the_name_of_a_data_sheet(tmp_path: Path) -> None:
+    """What stood in front of ``#`` was looked for: there was no such file."""
+    path = write_eds(tmp_path / "drive #2.eds", unknown())
+    assert (0x6075, 0) in read_makers_objects(str(path)).rows
+    assert assumptions_of(str(path)) == ()

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pmsmtool.data_types import BY_SHORT
-from pmsmtool.drive_maps.eds import decode, parse_eds, parse_integer, without_remark
+from pmsmtool.drive_maps.eds import NODE_ID_WORD, decode, parse_eds, parse_integer, without_remark
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import read_bytes
 from pmsmtool.sim.node.objects import ObjectRow
@@ -102,8 +102,7 @@ def read_makers_objects(where: str) -> MakersObjects:
 
     Raises ConfigError: the file cannot be read, holds no objects, or is no file of a drive (CiA 402).
     """
-    name, _, family = where.partition(FAMILY_MARK)
-    path = Path(name)
+    path, family = _path_and_family(where)
     data = read_bytes(path, hint="give the EDS or DCF that the drive's maker offers, or TABLE.csv#FAMILY")
     if path.suffix.lower() == ".csv":
         found, label = dict(_of_table(data, path, family)), family
@@ -125,10 +124,16 @@ def read_makers_objects(where: str) -> MakersObjects:
 
 def oddities_of(where: str) -> list[str]:
     """Return what is odd about an EDS or DCF, one line each, the first few; nothing of a table."""
-    path = Path(where)
-    found = () if FAMILY_MARK in where else parse_eds(read_bytes(path), "line", NODE_ID).warnings
+    path, family = _path_and_family(where)
+    found = () if family else parse_eds(read_bytes(path), "line", NODE_ID).warnings
     told = [text.replace("line:", "line ", 1) for text in found[:SHOWN]]
     return [*told, *([f"and {len(found) - SHOWN} more of that kind"] if len(found) > SHOWN else [])]
+
+
+def _path_and_family(where: str) -> tuple[Path, str]:
+    """Return the file and the family of a table; the name of a data sheet may have the mark in it, too."""
+    name, _, family = where.partition(FAMILY_MARK)
+    return (Path(name), family) if name.lower().endswith(".csv") else (Path(where), "")
 
 
 def _of_eds(data: bytes, path: Path) -> Iterator[tuple[tuple[int, int], ObjectRow]]:
@@ -220,9 +225,9 @@ def _value(text: str, kind: str) -> str:
             return str(float(text)) if abs(float(text)) <= LARGEST_BINARY32 else "0"
         value = parse_integer(text, NODE_ID)
     except ValueError:
-        return "0"
+        return "0" if code.is_float else ""  # the reader has told it
     bits = 8 * code.size
-    if "$NODEID" in text.upper() and NODE_ID <= value and value + LAST_NODE_ID < 1 << bits - code.is_signed:
+    if NODE_ID_WORD.search(text) and NODE_ID <= value and value + LAST_NODE_ID < 1 << bits - code.is_signed:
         return f"$NODEID+{value - NODE_ID:#x}"
     value %= 1 << bits
     return str(value - (1 << bits) if kind.startswith("I") and value >> bits - 1 else value)
