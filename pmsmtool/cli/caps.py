@@ -41,7 +41,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
 
     With --eds no bus is needed: a simulated drive with the objects of the file is read, with a motor set up in it.
     """
-    from pmsmtool.drive_maps.shipped_maps import GENERIC
+    from pmsmtool.drive_maps.shipped_maps import GENERIC, kin_of
     from pmsmtool.flash.map_gate import contradictions, other_drive, unknown_firmware
     from pmsmtool.measurement.capabilities import examine
     from pmsmtool.params.catalogue import BY_NAME
@@ -66,7 +66,9 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
         differ = other_drive(given, found.identity.vendor, found.identity.product, found.identity.doubt)
         out.warn(f"{differ}: what is listed is that map's, and nothing is written or moved through it")
     elif not found.map_is_drives:
-        doubt = found.identity.doubt or "no map names this drive"
+        kin = kin_of(found.identity.vendor)
+        others = f" ({kin}: of other products of its maker)" if kin and kin != found.drive_map.name else ""
+        doubt = found.identity.doubt or f"no map names this drive{others}"
         out.warn(f"{doubt}: {found.drive_map.name} was used, and nothing is written through it")
     elif firmware := unknown_firmware(found.drive_map, found.identity):
         out.warn(firmware)

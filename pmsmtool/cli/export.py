@@ -104,7 +104,7 @@ def dcf_command(design: Path, into: Path | None, node_id: int, map_file: Path | 
         sheet = parse_eds(base, str(into))
         drive_map = (map_file is None and family_of_sheet(sheet)) or drive_map
         differs = other_identity(sheet, drive_map)
-        if differs:
+        if differs and map_file is not None:
             out.warn(f"{into}: {differs}")
     wanted = _parameters(design, drive_map, out)
     return dcf_file(wanted, drive_map=drive_map, base=base, node_id=node_id, where=str(into or "EDS"))

@@ -58,7 +58,7 @@ def _faults(node: DriveNode) -> dict[str, Any]:
             word = int.from_bytes(node.sdo.read(objects.ERROR_HISTORY, sub, size=4), "little")
             code = word & 0xFFFF
             history.append({"code": code, "text": error_text(code), "additional": word >> 16})
-    code = node.whole(objects.ERROR_CODE)
+    code = node.fault_code()
     return {
         "node": node.node,
         "state": node.state(),

@@ -60,7 +60,7 @@ def flash_params_command(
     from pmsmtool.flash.download import set_named
 
     drive_map = read_map(map_file)
-    wanted = load_parameters(source, drive_map)  # a file that cannot be read needs no bus
+    wanted = load_parameters(source, None if map_file is None else drive_map)  # what cannot be read needs no bus
     if (source / "run.json").is_file():
         from pmsmtool.commissioning.report_page import verdict
 

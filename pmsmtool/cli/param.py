@@ -59,7 +59,7 @@ def get_command(bus: BusOptions, out: Output, names: tuple[str, ...], map_file: 
     """
     addresses = [text for text in names if _ADDRESS.fullmatch(text)]
     of_no_map = len(addresses) == len(names) and map_file is None
-    drive_map = read_map(None) if of_no_map else map_of_drive(bus, map_file, OWN_FAMILY)
+    drive_map = read_map(None) if of_no_map else map_of_drive(bus, map_file)
     wanted = [entry for name in names for entry in _resolve(name, drive_map)]
     with open_node(bus, None if of_no_map else drive_map, within_s=LOOKING_S) as node:
         if difference_of_drive(node):
@@ -131,10 +131,10 @@ def dump_command(bus: BusOptions, out: Output, everything: bool, path: Path | No
     """Print the drive's parameters as a parameter set that flash-params takes."""
     from pmsmtool.files import write_file
 
-    with open_node(bus, map_of_drive(bus, map_file, OWN_FAMILY), within_s=WHOLE_SET_S) as node:
+    with open_node(bus, map_of_drive(bus, map_file), within_s=WHOLE_SET_S) as node:
         warn_of_other_drive(node, out)
         _say_staged(node, out)
-        held = _device_set(node)
+        held = _device_set(node, out)
     text = (held if everything else _without_defaults(held)).to_toml()
     if path is not None:
         write_file(path, text)
@@ -162,11 +162,11 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
     from pmsmtool.errors import CheckFailed
     from pmsmtool.params.parameter_set import compare
 
-    drive_map = map_of_drive(bus, map_file, OWN_FAMILY) if "device" in (old, new) else read_map(map_file)
+    drive_map = map_of_drive(bus, map_file) if "device" in (old, new) else read_map(map_file)
     if "device" in (old, new):
         with open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
             warn_of_other_drive(node, out)
-            held = _device_set(node)
+            held = _device_set(node, out)
             sets = [held if side == "device" else _side(side, drive_map) for side in (old, new)]
     else:
         sets = [_side(side, drive_map) for side in (old, new)]
@@ -218,8 +218,12 @@ _Entry = tuple[str, tuple[int, int]]
 
 
 def _resolve(text: str, drive_map: DriveMap) -> list[_Entry]:
-    """Return what a name, a wildcard or an object means. Raises ConfigError: nothing has that name."""
-    from pmsmtool.errors import ConfigError
+    """Return what a name, a wildcard or an object means.
+
+    Raises ConfigError: nothing has that name; NotAvailable: the map has no object for it.
+    """
+    from pmsmtool.errors import ConfigError, NotAvailable
+    from pmsmtool.params.catalogue import BY_NAME
 
     address = _ADDRESS.fullmatch(text)
     if address is not None:
@@ -227,6 +231,11 @@ def _resolve(text: str, drive_map: DriveMap) -> list[_Entry]:
         names = [name for name in drive_map.cells if drive_map.address(name) == wanted]
         return [(names[0] if names else "", wanted)]
     found = [name for name in drive_map.cells if fnmatch.fnmatchcase(name, text)]
+    if not found and text in BY_NAME:
+        raise NotAvailable(
+            f"the map {drive_map.name!r} has no object for {text}",
+            hint="`pmsmtool caps` lists what it has, and why a value is left out",
+        )
     if not found:
         near = _near(text, drive_map.cells)
         raise ConfigError(
@@ -333,11 +342,17 @@ def _say_staged(node: DriveNode, out: Output) -> None:
         return  # a drive without staging
 
 
-def _device_set(node: DriveNode) -> ParameterSet:
+def _device_set(node: DriveNode, out: Output) -> ParameterSet:
+    """Return what the drive holds; rows of a family's map that this drive lacks are left out and told."""
     from pmsmtool.drive.parameters import DriveParameters
+    from pmsmtool.flash.map_gate import contradictions
 
-    found = DriveParameters(node).read([*node.map.cells, *node.map.tables])
-    return node.map.decode(found)
+    cells = node.map.cells
+    lacking = {} if node.map.staging else contradictions(node, cells)
+    for name, why in lacking.items():
+        out.warn(f"left out: {name} 0x{cells[name].index:04X}:{cells[name].sub:02X}: {why}")
+    names = [name for name, cell in cells.items() if not {name, cell.gain} & lacking.keys()]
+    return node.map.decode(DriveParameters(node).read([*names, *node.map.tables]))
 
 
 def _without_defaults(held: ParameterSet) -> ParameterSet:

@@ -18,7 +18,7 @@ from pmsmtool.drive_maps.dcf import Entry, new_dcf, write_concise
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.drive_maps.map_tables import encode_table, look_up_words
-from pmsmtool.drive_maps.sheet_check import contradictions, family_of_sheet, types_of
+from pmsmtool.drive_maps.sheet_check import contradictions, family_of_sheet, types_of, unnamed_sheet
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.image import crc32, pack_image
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE
@@ -90,7 +90,10 @@ def dcf_file(
     if wrong:
         more = len(wrong) - MOST_NAMED
         family = family_of_sheet(sheet)
-        its = "its map with --map" if family is None else f"--map {family.name}"
+        if family is None and drive_map.staging:  # nobody gave a map: it is the default
+            raise unnamed_sheet(sheet, where)
+        other = family is not None and family.name != drive_map.name
+        its = f"--map {family.name}" if family is not None and other else "a map of the drive with --map"
         raise ConfigError(
             f"the file contradicts {counted(len(wrong), 'row')} of the map {drive_map.name!r}",
             where=where, violations=[*wrong[:MOST_NAMED], *([f"and {more} more"] if more > 0 else [])],

@@ -13,7 +13,7 @@ from pmsmtool.design.loops.open_loops import SMALLER, smaller_gains
 from pmsmtool.drive_maps.dcf import values_of
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.eds import parse_eds
-from pmsmtool.drive_maps.sheet_check import other_identity
+from pmsmtool.drive_maps.sheet_check import family_of_sheet, other_identity, unnamed_sheet
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_bytes, read_text
 from pmsmtool.machine.machine_file import SCHEMA as MACHINE_SCHEMA
@@ -39,8 +39,8 @@ def load_parameters(path: str | Path, drive_map: DriveMap | None = None) -> Para
         ``params.toml``, ``design.toml`` (told apart by their schema), a ``.dcf``, a run directory, or a look-up table
         as ``lut`` writes it (``.npz``): that gives the table alone.
     drive_map : DriveMap, optional
-        What the objects of a DCF mean, the reference drive's when not given; of a design or a set for a drive with one
-        pair of current gains the smaller of both axes are taken.
+        What the objects of a DCF mean, the map of its drive's family when not given; of a design or a set for a drive
+        with one pair of current gains the smaller of both axes are taken.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def load_parameters(path: str | Path, drive_map: DriveMap | None = None) -> Para
     """
     path = _file(Path(path))
     if path.suffix.lower() in _DCF_SUFFIXES:
-        return _from_dcf(path, drive_map or reference_map())
+        return _from_dcf(path, drive_map)
     if path.suffix.lower() == ".npz":
         from pmsmtool.design.lookup.file import table_parameters
         from pmsmtool.npz_file import read_npz
@@ -100,17 +100,24 @@ def _file(path: Path) -> Path:
     return found
 
 
-def _from_dcf(path: Path, drive_map: DriveMap) -> ParameterSet:
+def _from_dcf(path: Path, drive_map: DriveMap | None) -> ParameterSet:
     sheet = parse_eds(read_bytes(path), str(path))
+    family = family_of_sheet(sheet)
+    drive_map = drive_map or family or reference_map()
     differs = other_identity(sheet, drive_map)
+    if differs and family is None and drive_map.staging:  # nobody gave a map: it is the default
+        raise unnamed_sheet(sheet, str(path))
     if differs:
+        its = "the map that this file is for with --map" if family is None else f"--map {family.name}"
         raise ConfigError(
             differs, where=str(path), likely="the file of another drive, whose objects mean something else",
-            hint="give the map that this file is for with --map, or the file of the map's drive",
+            hint=f"give {its}, or the file of the map's drive",
         )  # fmt: skip
     addresses = {name: drive_map.address(name) for name in (*drive_map.cells, *drive_map.tables)}
     values = values_of(sheet, frozenset(addresses.values()))
     found = {name: values[address] for name, address in addresses.items() if address in values}
+    if not found and family is None and drive_map.staging:
+        raise unnamed_sheet(sheet, str(path))
     if not found:
         raise ConfigError(
             f"holds no parameter of the drive family {drive_map.name}",

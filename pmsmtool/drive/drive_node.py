@@ -334,7 +334,7 @@ class DriveNode:
 
     def fault_error(self) -> DriveFault:
         """Return the error that tells the drive's fault: by 0x603F, else by its last emergency."""
-        code = self._fault_code()
+        code = self.fault_code()
         aborted = code == EXCITATION_ABORTED
         cause = "allow more (--speed-max, --i-max) or ask for less" if aborted else "remove the cause"
         named = f" {code:#06x}: {error_text(code)}" if code else ", and names no error (0x603F, emergencies)"
@@ -345,7 +345,8 @@ class DriveNode:
             hint=f"{cause}, then `pmsmtool fault reset -n {self.node}`",
         )
 
-    def _fault_code(self) -> int:
+    def fault_code(self) -> int:
+        """Return the code of the present error (0x603F, which is optional), else of the last emergency; 0: none."""
         try:
             return self.whole(objects.ERROR_CODE)
         except SdoAbort as abort:

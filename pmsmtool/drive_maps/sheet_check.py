@@ -9,7 +9,8 @@ from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap, SignalCell
 from pmsmtool.drive_maps.eds import Eds, parse_integer
 from pmsmtool.drive_maps.motion_objects import MotionObject
-from pmsmtool.drive_maps.shipped_maps import family_of
+from pmsmtool.drive_maps.shipped_maps import family_of, unnamed_drive
+from pmsmtool.errors import ConfigError
 
 _IDENTITY = 0x1018
 _TYPE_NAMES = {row.code: row.name for row in DATA_TYPES.values()}
@@ -28,10 +29,24 @@ def other_identity(sheet: Eds, drive_map: DriveMap) -> str:
     return f"the file is for {'; '.join(lines)}" if lines else ""
 
 
+def identity_of_sheet(sheet: Eds) -> tuple[int, int]:
+    """Return vendor and product of a data sheet's drive, 0 where the sheet does not say."""
+    stated = ((1, sheet.vendor), (2, sheet.product))
+    vendor, product = (next(_told(sheet, sub), number) or 0 for sub, number in stated)
+    return vendor, product
+
+
 def family_of_sheet(sheet: Eds) -> DriveMap | None:
     """Return the shipped map for the drive of a data sheet, None where there is none or the sheet does not say."""
-    vendor, product = (next(_told(sheet, sub), stated) or 0 for sub, stated in ((1, sheet.vendor), (2, sheet.product)))
-    return family_of(vendor, product)
+    return family_of(*identity_of_sheet(sheet))
+
+
+def unnamed_sheet(sheet: Eds, where: str) -> ConfigError:
+    """Return the refusal of a file whose drive no shipped map names, where none was given."""
+    return unnamed_drive(
+        *identity_of_sheet(sheet), where=where,
+        hint="give with --map a map with the rows that its manual documents; nothing was written",
+    )  # fmt: skip
 
 
 def _told(sheet: Eds, sub: int) -> Iterator[int]:

@@ -40,3 +40,24 @@ def family_of(vendor: int, product: int) -> DriveMap | None:
         return None
     maps = (load_family(name) for name in family_names())
     return next((drive_map for drive_map in maps if drive_map.is_for(vendor, product)), None)
+
+
+def kin_of(vendor: int) -> str:
+    """Return the families of other products of a maker, as a message names them; empty: there are none."""
+    maps = [load_family(name) for name in family_names()]
+    own = [one.name for one in maps if one.vendor == vendor != UNKNOWN_VENDOR and not one.identity.shared]
+    return ", ".join(own)
+
+
+def unnamed_drive(vendor: int, product: int, *, where: str, hint: str) -> ConfigError:
+    """Return the refusal to write what no shipped map describes; maps of the same maker are named."""
+    kin = kin_of(vendor)
+    likely = (
+        f"another product of the maker whose drives {kin} describes: compare the rows with your manual, and copy it"
+    )
+    return ConfigError(
+        f"no map names this drive: vendor {vendor:#010x} product {product:#x}",
+        where=where,
+        likely=likely if kin else "a drive whose gains stand in no shipped map",
+        hint=hint,
+    )

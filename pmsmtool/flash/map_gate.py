@@ -18,7 +18,7 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.drive_map_file import map_hash
-from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
+from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family, unnamed_drive
 from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
 from pmsmtool.files import make_folder, read_text, write_file
 from pmsmtool.flash.journal import JournalFolder
@@ -134,10 +134,10 @@ def _other_drive(drive_map: DriveMap, identity: Identity) -> ConfigError:
     """Return the refusal, with what leads on."""
     vendor, product = identity.vendor, identity.product
     if drive_map.staging and family_of(vendor, product) is None:  # nobody gave it: it is the default
-        return ConfigError(
-            f"no map names this drive: vendor {vendor:#010x} product {product:#x}",
+        return unnamed_drive(
+            vendor,
+            product,
             where=_where(identity),
-            likely="a drive whose gains stand in no shipped map",
             hint="enter the gains of design.toml with the maker's own tool, or write a map with the rows that its "
             "manual documents and give it with --map; to copy a drive that is set up: `pmsmtool backup --eds FILE`, "
             "then `pmsmtool restore --other-drive`; nothing was moved or written",

@@ -371,3 +371,48 @@ def test_a_position_of_unknown_unit_stands_in_no_chains_way(tool: Tool) -> None:
     assert json.loads(tool("caps", "--eds", "x.eds", "--json")[1])["level"] == "manual"
     code, _, said = tool("--yes", "commission", str(machine_path("interior-2k2")), "--eds", "x.eds", "--json")
     assert code == 10, said
+
+
+def test_a_fault_is_shown_without_an_error_code(tool: Tool) -> None:
+    """0x603F is optional (CiA 402-2): of 33 makers' files 21 lack it, and `fault show` ended in exit code 4."""
+    write_eds(Path("x.eds"), unknown())
+    code, said, _ = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "fault", "show")
+    assert code == 0 and "SWITCH ON DISABLED" in said
+
+
+def test_parameters_of_a_drive_that_no_map_names_are_those_of_the_standard(tool: Tool) -> None:
+    """They were read through the reference drive's map: what 0x2010:01 holds on it was the number of pole pairs."""
+    write_eds(Path("x.eds"), unknown("0x2D", (0x2010, 1, "U8", "rw", "7"), (0x6080, 0, "U32", "rw", "4500")))
+    channel = "interior-2k2?nv=:memory:&eds=x.eds"
+    code, said, _ = tool("--sim", channel, "param", "dump", "--all")
+    assert code == 0 and "n_max_rpm = " in said and "pole_pairs" not in said
+    code, _, said = tool("--sim", channel, "param", "get", "motor.pole_pairs")
+    assert code == 9 and "the map 'cia402' has no object for motor.pole_pairs" in said
+
+
+def test_a_row_that_this_drive_of_the_family_lacks_ends_no_dump(tool: Tool) -> None:
+    rows = tuple(row for row in faulhaber() if row[0] != 0x2350)
+    write_eds(Path("x.eds"), (*rows, (0x6081, 0, "U32", "rw", "1000")))
+    code, said, told = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "param", "dump", "--all")
+    assert code == 0 and "profile_speed_rpm = " in said
+    assert "left out: motor.pole_pairs 0x2350:03: the drive has no such object" in told
+
+
+def test_the_file_of_a_known_family_needs_no_map_and_that_of_an_unknown_one_is_told_so(tool: Tool) -> None:
+    """Both were compared with the reference drive: "the file contradicts 100 rows of the map 'pmsmsim'"."""
+    rows = [(*row[:4], "30600000") if row[:2] == (0x30A0, 1) else row for row in epos4()]
+    path = write_eds(Path("known.dcf"), rows)
+    path.write_text(path.read_text("ascii").replace("DefaultValue=30600000", "ParameterValue=30600000"), "ascii")
+    channel = "interior-2k2?nv=:memory:&eds=known.dcf"
+    code, _, said = tool("--sim", channel, "--yes", "flash-params", "known.dcf", "--dry-run")
+    assert code == 0, said
+    write_eds(Path("x.eds"), unknown())
+    write_eds(Path("kin.eds"), epos4(product=0x61000000))
+    assert tool("tune", str(machine_path("interior-2k2")), "-o", "design.toml")[0] == 0
+    for name, why in (("x.eds", "no shipped map"), ("kin.eds", "epos2, epos4 describes")):
+        of_it = ("--sim", f"interior-2k2?nv=:memory:&eds={name}", "--yes")
+        for words in (("export", "dcf", "design.toml", "--into", name), (*of_it, "flash-params", name, "--dry-run")):
+            code, _, said = tool(*words)
+            assert code == 2 and "no map names this drive" in said and why in said and "pmsmsim" not in said
+    code, _, said = tool("caps", "--eds", "kin.eds")
+    assert code == 0 and "no map names this drive (epos2, epos4: of other products of its maker)" in said
