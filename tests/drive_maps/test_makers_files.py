@@ -92,10 +92,17 @@ def test_a_vendor_number_is_there(maker: str) -> None:
     assert load_family("ingenia").vendor == 0x29C
 
 
-@pytest.mark.parametrize("product", [0x61500000, 0x65510000, 0x65520000, 0x68500000])
-def test_products_of_the_epos4(product: int) -> None:
-    found = family_of(0xFB, product)
-    assert found is not None and found.name == "epos4"
+@pytest.mark.parametrize(
+    ("family", "vendor", "product"),
+    [
+        *(("epos4", 0xFB, product) for product in (0x61500000, 0x64500000, 0x65510000, 0x65520000, 0x68500000)),
+        *(("nanotec", 0x26C, product) for product in (0x05, 0x06, 0x10, 0x5B)),
+    ],
+)
+def test_products_of_a_family(family: str, vendor: int, product: int) -> None:
+    """Another product with the same objects was a drive that no map names: its 0x6076 was read 1000 times too large."""
+    found = family_of(vendor, product)
+    assert found is not None and found.name == family
 
 
 @needs_table
