@@ -96,18 +96,20 @@ def dcf_command(design: Path, into: Path | None, node_id: int, map_file: Path | 
     from pmsmtool.drive_maps.eds import parse_eds
     from pmsmtool.drive_maps.sheet_check import family_of_sheet, other_identity
 
-    drive_map = read_map(map_file)
+    drive_map, given = read_map(map_file), map_file is not None
     if into is None and map_file is not None:
         raise click.UsageError("--map needs --into: the data sheet of that drive")
     base = None if into is None else read_bytes(into, hint="give with --into an EDS or DCF that you may read")
     if base is not None:
         sheet = parse_eds(base, str(into))
-        drive_map = (map_file is None and family_of_sheet(sheet)) or drive_map
+        family = None if given else family_of_sheet(sheet)
+        drive_map, given = family or drive_map, given or family is not None
         differs = other_identity(sheet, drive_map)
-        if differs and map_file is not None:
+        if differs and given:
             out.warn(f"{into}: {differs}")
     wanted = _parameters(design, drive_map, out)
-    return dcf_file(wanted, drive_map=drive_map, base=base, node_id=node_id, where=str(into or "EDS"))
+    known = drive_map if given else None
+    return dcf_file(wanted, drive_map=known, base=base, node_id=node_id, where=str(into or "EDS"))
 
 
 @export_command.command("cdcf", epilog=examples("pmsmtool export cdcf design.toml -o drive.cdcf"))

@@ -80,7 +80,7 @@ def dcf_file(
     where : str
         Name of the base for messages.
     """
-    drive_map = drive_map or reference_map()
+    given, drive_map = drive_map is not None, drive_map or reference_map()
     if base is None:
         base = (data_folder("firmware-params") / drive_map.name / f"{drive_map.name}.eds").read_bytes()
     encoded = drive_map.encode(checked(wanted))
@@ -90,7 +90,7 @@ def dcf_file(
     if wrong:
         more = len(wrong) - MOST_NAMED
         family = family_of_sheet(sheet)
-        if family is None and drive_map.staging:  # nobody gave a map: it is the default
+        if family is None and not given:
             raise unnamed_sheet(sheet, where)
         other = family is not None and family.name != drive_map.name
         its = f"--map {family.name}" if family is not None and other else "a map of the drive with --map"

@@ -103,9 +103,10 @@ def _file(path: Path) -> Path:
 def _from_dcf(path: Path, drive_map: DriveMap | None) -> ParameterSet:
     sheet = parse_eds(read_bytes(path), str(path))
     family = family_of_sheet(sheet)
+    nobodys = drive_map is None and family is None
     drive_map = drive_map or family or reference_map()
     differs = other_identity(sheet, drive_map)
-    if differs and family is None and drive_map.staging:  # nobody gave a map: it is the default
+    if differs and nobodys:
         raise unnamed_sheet(sheet, str(path))
     if differs:
         its = "the map that this file is for with --map" if family is None else f"--map {family.name}"
@@ -116,7 +117,7 @@ def _from_dcf(path: Path, drive_map: DriveMap | None) -> ParameterSet:
     addresses = {name: drive_map.address(name) for name in (*drive_map.cells, *drive_map.tables)}
     values = values_of(sheet, frozenset(addresses.values()))
     found = {name: values[address] for name, address in addresses.items() if address in values}
-    if not found and family is None and drive_map.staging:
+    if not found and nobodys:
         raise unnamed_sheet(sheet, str(path))
     if not found:
         raise ConfigError(

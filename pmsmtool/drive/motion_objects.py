@@ -180,14 +180,17 @@ def shown_current(node: DriveNode, rated: float) -> Quantity:
     own = _own(node, "current")
     if own is not None and node.held(own.item) is not None:
         return own
-    if node.held(objects.CURRENT_PERMILLE) is not None:
+    if _permille(node, objects.CURRENT_PERMILLE):
         return Quantity(objects.CURRENT_PERMILLE, 1e-3 * rated)
     signal = node.map.signals.get("i_q_a")
     if signal is not None and not wire_unit(signal.unit).relative_to:
         return Quantity(DriveObject(signal.index, signal.sub, LETTERS[signal.wire]), wire_unit(signal.unit).scale)
-    if node.held(TORQUE_PERMILLE) is not None:
+    if _permille(node, TORQUE_PERMILLE):
         return Quantity(TORQUE_PERMILLE, 1e-3 * rated)
-    raise NotAvailable("the drive shows neither current (0x6078) nor torque (0x6077)", where=f"node {node.node}")
+    raise NotAvailable(
+        "the drive shows neither current (0x6078) nor torque (0x6077) in a unit that is known",
+        where=f"node {node.node}",
+    )
 
 
 def undecided(node: DriveNode, rated: float) -> bool:
@@ -199,6 +202,15 @@ def undecided(node: DriveNode, rated: float) -> bool:
     return shown.undecided
 
 
+def _permille(node: DriveNode, item: DriveObject) -> bool:
+    """Whether a torque or current is there and counts permille of the rated one, as CiA 402 has it.
+
+    In 32 bits, of a drive that has no rated current (0x6075) to be a share of, it is the maker's unit: who says which?
+    """
+    held = node.held(item) is not None
+    return held and (node.typed(item).size <= item.size or node.held(objects.RATED_CURRENT_MA) is not None)
+
+
 def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
     """Return what takes a torque current: mode 4, else 10, as 0x6502 announces, else the maker's own.
 
@@ -207,7 +219,7 @@ def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
     Raises NotAvailable: the drive has no such mode, or no target in it.
     """
     modes = int(node.held(objects.SUPPORTED_MODES) or 0)
-    if node.map.capabilities.torque_mode is not False and node.held(objects.TARGET_TORQUE_PERMILLE) is not None:
+    if node.map.capabilities.torque_mode is not False and _permille(node, objects.TARGET_TORQUE_PERMILLE):
         order = (Mode.PROFILE_TORQUE, Mode.CYCLIC_TORQUE)
         for mode in reversed(order) if slow_slope_s(node) else order:
             if modes >> mode - 1 & 1:
@@ -215,9 +227,12 @@ def torque_target(node: DriveNode, rated: float) -> TorqueTarget:
     own = _own(node, "target_current")
     if own is not None and node.held(own.item) is not None:
         return TorqueTarget(own, node.map.motion["target_current"].mode)
+    wide = node.held(objects.TARGET_TORQUE_PERMILLE) is not None and not _permille(node, objects.TARGET_TORQUE_PERMILLE)
     raise NotAvailable(
-        f"the drive has no torque mode that pmsmtool supports (0x6502 = {modes:#x})", where=f"node {node.node}"
-    )
+        f"the drive has no torque mode that pmsmtool supports (0x6502 = {modes:#x})", where=f"node {node.node}",
+        likely="0x6071 has 32 bits and there is no 0x6075: its unit is the maker's, not permille" if wide else "",
+        hint="state it in a map (`target_current`)" if wide else "`pmsmtool caps` lists what this drive can measure",
+    )  # fmt: skip
 
 
 def cyclic_period_s(node: DriveNode, wanted_s: float) -> float:

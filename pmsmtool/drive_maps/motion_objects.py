@@ -138,7 +138,7 @@ def _object(name: str, row: Mapping[str, Any], tell: Complain) -> MotionObject |
 
 
 PLATE: Mapping[str, str] = {
-    "rated_current": '{ number = ?, unit = "A rms", source = "plate" }  # or "A peak": which its 0x6071 counts',
+    "rated_current": '{ number = ?, unit = "A rms", source = "plate" }  # or "A peak": 0x6071 counts permille of it',
     "counts_per_turn": '{ number = ?, source = "plate" }  # units of 0x6064 per turn of the motor',
 }
 """Rows that a name plate or a manual fills, as text; what is to be written there is a question mark, no number."""

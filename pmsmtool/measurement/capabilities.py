@@ -68,8 +68,9 @@ FEATURES: Mapping[str, str] = {
     "excitation": "voltage or current injection",
     "averages": "averages inside the drive",
     "recorder": "a recorder of currents and voltages that this program reads",
-    "torque mode": "torque mode (0x6502 bit 3 or 9)",
-    "push": "torque mode (0x6502 bit 3 or 9), or a velocity mode whose unit a map states, with a current limit",
+    "torque mode": "torque mode (0x6502 bit 3 or 9; 0x6071, in permille)",
+    "push": "torque mode (0x6502 bit 3 or 9; 0x6071, in permille), or a velocity mode whose unit a map states, with a "
+    "current limit",
     "position": "position in units of a known number per turn (0x6064 with 0x608F, no gear or factor in 0x6091 and "
     "0x6093, or in a map: an object, or a number)",
     "range": f"a position of {LEAST_TURNS} turns or more before it begins again (32 bits in 0x6064, and 0x607B)",
@@ -81,7 +82,7 @@ FEATURES: Mapping[str, str] = {
         "the maker's identification of it, with its result, in a map that names this drive",
     ),
     "line voltage": "the DC link (0x6079), or the machine's voltage in the drive map",
-    "current": "its current (0x6078) or torque (0x6077)",
+    "current": "its current (0x6078) or torque (0x6077) in a known unit",
     "bench supply": "a bench supply whose power a person reads (`pmsmtool identify R --supply`)",
 }
 """What methods need, as a person reads it."""
@@ -100,6 +101,8 @@ _SEEN = ("position", "range")
 """What shows the speed."""
 _STANDARD = (*_BOUNDED, *_SEEN, "commutation angle")
 _PUSH = (*_BOUNDED, "push", *_SEEN, "current")
+_MOVES = (*_BOUNDED, *_SEEN, "current", "profile position")
+"""What a move by the drive's own position loop needs: its current is watched."""
 _WATCHED = (*_SAFE, *_SEEN, "current")
 """What the guard needs while the drive runs by itself."""
 
@@ -266,7 +269,7 @@ class Capabilities:
     @property
     def by_moves(self) -> str:
         """What leads on where a drive is not pushed, but moves by its position loop; else empty."""
-        moves = self.features >= {*_BOUNDED, *_SEEN, "profile position"} and "push" not in self.features
+        moves = self.features >= {*_MOVES} and "push" not in self.features
         return "; `pmsmtool move --identify` finds inertia and friction by moves" if moves else ""
 
     @property
@@ -274,7 +277,8 @@ class Capabilities:
         """The map file whose numbers, from the name plate, let a drive move that no map names; else empty."""
         vendor, product = self.identity.vendor_product
         lacking = [row for need, row in _ON_PLATE.items() if need not in self.features]
-        moves = "supervision" in self.features and self.features & {"push", "profile position"}
+        given = self.features | _ON_PLATE.keys()
+        moves = given >= {*_PUSH} or given >= {*_MOVES}
         unnamed = self.drive_map.name == GENERIC and vendor != UNKNOWN_VENDOR
         return tuple(blank_map(vendor, product, lacking)) if lacking and moves and unnamed else ()
 

@@ -114,7 +114,7 @@ def test_a_drive_without_torque_mode_is_led_to_moves(tool: Tool, rows: tuple[Row
         assert code == 9 and ("`pmsmtool move --identify` finds inertia" in said) == told, said
 
 
-@pytest.mark.parametrize(("rows", "next_step"), [(epos4(), "or --map epos4"), (unknown(), "its map with --map")])
+@pytest.mark.parametrize(("rows", "next_step"), [(epos4(), "or --map epos4"), (unknown(), "a map of the drive")])
 def test_the_file_of_another_drive_is_refused_in_a_few_lines(tool: Tool, rows: tuple[Row, ...], next_step: str) -> None:
     """The hundred objects of the reference drive were listed one by one."""
     write_eds(Path("x.eds"), rows)

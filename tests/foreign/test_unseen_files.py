@@ -164,6 +164,38 @@ def test_whole_numbers_of_another_width_are_taken_as_the_drive_has_them(tool: To
     assert code == 10 and verdicts["shaft"] == verdicts["encoder sign"] == "ok", said
 
 
+WIDE: tuple[Row, ...] = ((0x6071, 0, "I32", "rw", "0"), (0x6077, 0, "I32", "ro", ""), (0x6078, 0, "I32", "ro", ""))
+
+
+def test_a_torque_of_32_bits_is_no_share_where_the_drive_has_no_rated_current(tool: Tool) -> None:
+    """Such drives count mA. They were commanded in permille of the rated current that a name plate gave."""
+    write_eds(Path("x.eds"), unknown("0x2D", *WIDE, without=(0x6075,)))
+    code, said, _ = tool("caps", "--eds", "x.eds")
+    assert code == 0 and "0x6071, in permille" in said and "in place of ?" not in said
+    rated = 'rated_current = { number = 4.3, unit = "A rms", source = "plate" }'
+    head = 'schema = "pmsmtool.drive-map/1"\nname = "mine"\nvendor = 0x1DD\nproduct = 0x10305070\n[motion]\n'
+    Path("mine.toml").write_text(f'{head}{rated}\n[sources]\nplate = "its plate"\n', encoding="ascii")
+    channel = "interior-2k2?nv=:memory:&eds=x.eds"
+    assert tool("--sim", channel, "--yes", "identify", "mechanics", "--map", "mine.toml")[0] == 9
+    own = [
+        f'{name} = {{ index = {index}, sub = 0, type = "INTEGER32", unit = "mA rms"{mode}, source = "plate" }}'
+        for name, index, mode in (("target_current", 0x6071, ", mode = 4"), ("current", 0x6078, ""))
+    ]
+    Path("mine.toml").write_text("\n".join((head, rated, *own, '[sources]\nplate = "a"\n')), encoding="ascii")
+    code, said, _ = tool("--sim", channel, "caps", "--map", "mine.toml")
+    assert code == 0 and "capability level standard" in said
+
+
+@pytest.mark.parametrize("gone", [(0x6075, 0x6077, 0x6078), (0x6075, 0x1016)])
+def test_a_map_is_not_offered_for_a_drive_that_it_would_not_move(tool: Tool, gone: tuple[int, ...]) -> None:
+    """ "`pmsmtool move` moves it with --map mine.toml": it ended so, "the drive shows neither current nor torque"."""
+    position = ((0x607A, 0, "I32", "rw", "0"), (0x6062, 0, "I32", "ro", "0"), (0x6081, 0, "U32", "rw", "1000"))
+    write_eds(Path("x.eds"), unknown("0x25", *position, without=(*gone, 0x6071)))
+    assert "in place of ?" not in tool("caps", "--eds", "x.eds")[1]
+    write_eds(Path("x.eds"), unknown("0x25", *position, without=(0x6075, 0x6071)))
+    assert "`pmsmtool move` moves it with --map mine.toml" in tool("caps", "--eds", "x.eds")[1]
+
+
 @pytest.mark.chain
 def test_a_drive_that_no_map_names_needs_no_speed_limit_of_its_own(tool: Tool) -> None:
     code, verdicts, said = checked(tool, unknown(without=(0x6080,)))
