@@ -24,6 +24,7 @@ from pmsmtool.drive_maps.eds import (
     object_of,
     parse_eds,
     parse_integer,
+    parse_real,
     sections_of,
 )
 from pmsmtool.errors import ConfigError, next_step
@@ -79,7 +80,7 @@ def decode_value(data_type: int, text: str, node_id: int | None = None) -> bytes
     """
     try:
         if data_type in (REAL32, REAL64):
-            return encode(data_type, float(text))
+            return encode(data_type, parse_real(text, data_type))
         if data_type in INTEGER_BITS:
             value = parse_integer(text, node_id)
             bits = INTEGER_BITS[data_type]

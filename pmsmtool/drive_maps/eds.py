@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import codecs
 import re
+import struct
 from collections.abc import Container, Iterator
 from dataclasses import dataclass, field
 
@@ -19,6 +20,7 @@ UNSIGNED8, REAL32, REAL64, VISIBLE_STRING, OCTET_STRING, UNICODE_STRING, DOMAIN 
     "UNSIGNED8", "REAL32", "REAL64", "VISIBLE_STRING", "OCTET_STRING", "UNICODE_STRING", "DOMAIN"
 )
 INTEGER_BITS = {row.code: 8 * row.size for row in DATA_TYPES.values() if row.is_integer}
+NUMBERS = frozenset({*INTEGER_BITS, REAL32, REAL64})
 SIGNED = frozenset(row.code for row in DATA_TYPES.values() if row.is_signed)
 _VAR, _DOMAIN_OBJECT = 0x07, 0x02
 _HAVE_SUBS: Container[object] = frozenset({0x06, 0x08, 0x09})  # DEFSTRUCT, ARRAY, RECORD
@@ -139,6 +141,22 @@ def parse_integer(text: str, node_id: int | None = None) -> int:
     return total
 
 
+def parse_real(text: str, data_type: int) -> float:
+    """Return a number of a real type: as such, or as some makers write it, the hex word of its bits (IEC 60559).
+
+    Raises ValueError: if it is neither.
+    """
+    text = without_remark(text)
+    size, letter = (4, "<f") if data_type == REAL32 else (8, "<d")
+    if not text.lower().startswith("0x"):
+        return float(text)
+    try:
+        (value,) = struct.unpack(letter, int(text, 16).to_bytes(size, "little"))
+    except OverflowError as error:
+        raise ValueError(f"{text} does not fit {8 * size} bits") from error
+    return float(value)
+
+
 def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Eds:
     """Return the data sheet. Raises ConfigError: if the file has no object at all.
 
@@ -155,10 +173,11 @@ def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Ed
     warnings: list[str] = []
     sections = _sections(text, where, warnings)
     info = sections.get("deviceinfo", Section("", 0))
-    stated = next((sections[name].get("nodeid") for name in COMMISSIONING if name in sections), "")
-    node = _number(stated, None, f"{where}: NodeID", warnings)
+    commissioning = next((sections[name] for name in COMMISSIONING if name in sections), Section("", 0))
+    stated, line = commissioning.entries.get("nodeid", ("", 0))
+    node = _number(stated, None, f"{where}:{line}: NodeID", warnings)
     if isinstance(node, int) and not 1 <= node <= LAST_NODE_ID:  # 255: none was given yet (CiA 305)
-        warnings.append(f"{where}: NodeID {node} is none of 1..{LAST_NODE_ID}, left out")
+        warnings.append(f"{where}:{line}: NodeID {node} is none of 1..{LAST_NODE_ID}, left out")
         node = None
     node = node if isinstance(node, int) else node_id
     objects: dict[tuple[int, int], EdsObject] = {}
@@ -186,7 +205,8 @@ def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Ed
         )
 
     def identity(key: str) -> int | None:
-        number = _number(info.get(key), None, f"{where}: [DeviceInfo] {key}", warnings)
+        text, line = info.entries.get(key, ("", 0))
+        number = _number(text, None, f"{where}:{line}: [DeviceInfo] {key}", warnings)
         return number if isinstance(number, int) else None
 
     return Eds(
@@ -323,7 +343,7 @@ def _entry(
         text = section.get(key)
         if data_type in INTEGER_BITS and OCTAL.fullmatch(text) and int(text) != int(text, 8):
             warnings.append(f"{place}sub{sub:X} {key}: {text} is taken for a decimal; an octal one is {int(text, 8)}")
-        elif data_type in INTEGER_BITS and key.endswith("value"):
+        elif data_type in NUMBERS and key.endswith("value"):
             _number(text, data_type, f"{place}sub{sub:X} {key}", warnings, node)  # says what is no number
     return EdsObject(
         index,
@@ -347,7 +367,7 @@ def _number(
         return None
     try:
         if data_type in (REAL32, REAL64):
-            return float(without_remark(text))
+            return parse_real(text, data_type)
         value = parse_integer(text, node)
     except ValueError as error:
         if "node id" not in str(error):

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pmsmtool.data_types import DATA_TYPES
+from pmsmtool.drive_maps.dcf import decode_value
 from pmsmtool.drive_maps.eds import parse_eds, parse_integer
 from pmsmtool.errors import ConfigError
 from pmsmtool.sim.foreign.drive import assumptions_of
@@ -192,3 +193,16 @@ def test_a_mark_of_tables_in_the_name_of_a_data_sheet(tmp_path: Path) -> None:
     path = write_eds(tmp_path / "drive #2.eds", unknown())
     assert (0x6075, 0) in read_makers_objects(str(path)).rows
     assert assumptions_of(str(path)) == ()
+
+
+def test_a_real_number_as_the_word_of_its_bits(tmp_path: Path) -> None:
+    """One maker writes limits of REAL32 so: they were left out, and a default was 0."""
+    rows = (*unknown(), (0x2012, 0, "REAL32", "rw", "0x461C4000"))
+    path = write_eds(tmp_path / "x.eds", rows, {(0x2012, 0): (0, "0x49742400")})
+    entry = parse_eds(path.read_bytes()).objects[0x2012, 0]
+    assert (entry.low, entry.high) == (0.0, 1e6)
+    assert read_makers_objects(str(path)).rows[0x2012, 0].default == "10000.0"
+    assert decode_value(entry.data_type, "0x461C4000") == decode_value(entry.data_type, "1e4")
+    assert assumptions_of(str(path)) == ()
+    odd = parse_eds(path.read_bytes().replace(b"0x461C4000", b"0x1461C4000")).warnings
+    assert "2012sub0 defaultvalue: '0x1461C4000' is not a number, left out" in odd[0]

@@ -88,7 +88,9 @@ def unknown(modes: str = "0x2D", *more: Row, without: tuple[int, ...] = ()) -> t
     return (*(row for row in rows if row[0] not in gone), *more)
 
 
-def write_eds(path: Path, rows: Iterable[Row], limits: dict[tuple[int, int], tuple[int, int]] | None = None) -> Path:
+def write_eds(
+    path: Path, rows: Iterable[Row], limits: dict[tuple[int, int], tuple[int | str, int | str]] | None = None
+) -> Path:
     """Write the rows as an EDS; limits by address."""
     lines = ["[FileInfo]", "FileName=x.eds", "[DeviceInfo]", "ProductName=drive of a test"]
     heads: set[int] = set()

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pmsmtool.data_types import BY_SHORT
-from pmsmtool.drive_maps.eds import NODE_ID_WORD, decode, parse_eds, parse_integer, without_remark
+from pmsmtool.drive_maps.eds import NODE_ID_WORD, decode, parse_eds, parse_integer, parse_real, without_remark
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import read_bytes
 from pmsmtool.sim.node.objects import ObjectRow
@@ -192,7 +192,8 @@ def _of_table(data: bytes, path: Path, family: str) -> Iterator[tuple[tuple[int,
 
 def _limit(text: str, kind: str) -> int | float | None:
     try:
-        value = float(text) if BY_SHORT[kind].is_float else parse_integer(text, NODE_ID) if text.strip() else None
+        is_float, code = BY_SHORT[kind].is_float, BY_SHORT[kind].code
+        value = parse_real(text, code) if is_float else parse_integer(text, NODE_ID) if text.strip() else None
     except ValueError:
         return None
     bits = 8 * BY_SHORT[kind].size
@@ -222,7 +223,8 @@ def _value(text: str, kind: str) -> str:
         return "0" if code.is_float else ""  # blank: the file does not say
     try:
         if code.is_float:
-            return str(float(text)) if abs(float(text)) <= LARGEST_BINARY32 else "0"
+            number = parse_real(text, code.code)
+            return str(number) if abs(number) <= LARGEST_BINARY32 else "0"
         value = parse_integer(text, NODE_ID)
     except ValueError:
         return "0" if code.is_float else ""  # the reader has told it
