@@ -27,7 +27,7 @@ def stop_command(bus: BusOptions, out: Output, everyone: bool) -> None:
 
     Exit code 8 when a drive does not confirm, or none answers: the machine may be energised, use the hardware stop.
     A drive that brakes has the time of its ramp; one without a valid answer for 2 s has not confirmed. Several drives
-    are stopped at the same time. It waits for no other program.
+    are stopped at the same time, then further axes of a device that has several. It waits for no other program.
     """
     from pmsmtool.drive.drive_node import DriveNode, state_text
 
@@ -67,14 +67,16 @@ def _stop_together(
     """Stop all at the same time, so that the last does not turn until the first has stood still."""
     from concurrent.futures import ThreadPoolExecutor
 
-    from pmsmtool.drive.stop import ask_at_once, quick_stop
+    from pmsmtool.drive.stop import ask_at_once, quick_stop, stop_other_axes
     from pmsmtool.errors import BusError, PmsmtoolError
 
     def stop(node: DriveNode) -> State | PmsmtoolError:
         try:
-            return quick_stop(node, say=lambda text: out.status(f"node {node.node}: {text}"))
+            state = quick_stop(node, say=lambda text: out.status(f"node {node.node}: {text}"))
+            stop_other_axes(node)
         except PmsmtoolError as error:
             return error
+        return state
 
     for node in nodes:
         with contextlib.suppress(BusError):

@@ -6,13 +6,14 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 from pmsmtool.bus.busy import when_ready
 from pmsmtool.bus.sdo import OutOfTime
 from pmsmtool.bus.supervision import NodeReset
-from pmsmtool.cia402 import Command, QuickStop, State
+from pmsmtool.cia402 import Command, QuickStop, State, state_of
 from pmsmtool.drive import objects
-from pmsmtool.drive.drive_node import STATE_TIMEOUT_S, DriveNode, is_safe, state_text
+from pmsmtool.drive.drive_node import POLL_S, STATE_TIMEOUT_S, DriveNode, is_safe, state_text
 from pmsmtool.drive_maps.drive_map import LETTERS
 from pmsmtool.errors import BusError, DriveFault, PmsmtoolError, SdoAbort, StopNotConfirmed
 
@@ -39,6 +40,8 @@ STOP_TRIES = 4
 """A stop is asked for this often: each kind of alarm may end one attempt."""
 BUSY_S = 3.0
 """A drive that refuses because it is busy is asked again for so long."""
+AXIS_STEP, LAST_AXIS = 0x800, 8
+"""Between the objects of one axis and of the next, and how many axes a device has at most (CiA 402-1)."""
 STANDSTILL_MRPM = 5_000.0
 """Speed (thousandths of rpm) below which a drive that stays in quick stop counts as standing."""
 
@@ -96,6 +99,51 @@ def disable(node: DriveNode) -> State:
     if state is None or not is_safe(state):
         raise not_confirmed(node, f"the statusword still shows {state_text(state)}")
     return state
+
+
+def stop_other_axes(node: DriveNode) -> None:
+    """Stop the further axes of a device that has several, each with its own controlword and statusword.
+
+    Every other command of this program knows the first alone.
+
+    Raises StopNotConfirmed: one may be energised.
+    """
+    for axis in range(2, LAST_AXIS + 1):
+        shift = (axis - 1) * AXIS_STEP
+        control, status = (
+            replace(item, index=item.index + shift) for item in (objects.CONTROLWORD, objects.STATUSWORD)
+        )
+        shown: State | None = None
+        try:
+            with node.sdo.limited(silence_s=SILENCE_S, own_s=OWN_S, total_s=ANSWERS_S):
+                word = node.held(status)
+                if word is None:
+                    return
+                shown = state_of(int(word))
+                for command in (Command.QUICK_STOP, Command.DISABLE_VOLTAGE):
+                    if not is_safe(shown):
+                        shown = _commanded(node, control, status, command)
+        except (BusError, DriveFault) as error:
+            if axis == 2 and shown is None:  # nothing says that there is a second one
+                return
+            raise not_confirmed(node, f"axis {axis}: {error.what}") from error
+        if not is_safe(shown):
+            raise not_confirmed(node, f"axis {axis} shows {state_text(shown)} (0x{status.index:04X})")
+
+
+def _commanded(
+    node: DriveNode, control: objects.DriveObject, status: objects.DriveObject, command: Command
+) -> State | None:
+    """Give an axis a command, wait until it is safe or does not become so; return its state."""
+    clock = node.connection.clock
+    with contextlib.suppress(SdoAbort):
+        node.command(control, command)
+    deadline_s = clock.now() + STATE_TIMEOUT_S
+    shown = state_of(node.whole(status))
+    while not is_safe(shown) and clock.now() < deadline_s:
+        node.connection.wait(POLL_S)
+        shown = state_of(node.whole(status))
+    return shown
 
 
 def ask_at_once(node: DriveNode) -> None:

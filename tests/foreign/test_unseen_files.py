@@ -448,3 +448,12 @@ def test_the_file_of_a_known_family_needs_no_map_and_that_of_an_unknown_one_is_t
             assert code == 2 and "no map names this drive" in said and why in said and "pmsmsim" not in said
     code, _, said = tool("caps", "--eds", "kin.eds")
     assert code == 0 and "no map names this drive (epos2, epos4: of other products of its maker)" in said
+
+
+@pytest.mark.parametrize(("word", "code"), [("0x0240", 0), ("0x0237", 8)])
+def test_a_further_axis_that_stays_on_is_no_confirmed_stop(tool: Tool, word: str, code: int) -> None:
+    """ "stopped", exit code 0, was said of a device whose second axis was in operation enabled."""
+    axis = ((0x6840, 0, "U16", "rw", "0"), (0x6841, 0, "U16", "ro", word))
+    write_eds(Path("x.eds"), unknown("0x2D", *axis))
+    ended, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "stop")
+    assert ended == code and ("axis 2 shows OPERATION ENABLED (0x6841)" in said) == (code == 8)
