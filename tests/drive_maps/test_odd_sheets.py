@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -206,3 +207,15 @@ def test_a_real_number_as_the_word_of_its_bits(tmp_path: Path) -> None:
     assert assumptions_of(str(path)) == ()
     odd = parse_eds(path.read_bytes().replace(b"0x461C4000", b"0x1461C4000")).warnings
     assert "2012sub0 defaultvalue: '0x1461C4000' is not a number, left out" in odd[0]
+
+
+def test_an_object_of_the_standard_without_a_type_has_the_standards(tmp_path: Path) -> None:
+    """Without the type of 0x6071 or 0x6075 it was a drive without torque mode, or without a rated current."""
+    path = write_eds(tmp_path / "x.eds", unknown())
+    text = path.read_bytes()
+    for index, kind in (("6071", "I16"), ("6075", "U32")):
+        path.write_bytes(re.sub(rf"(\[{index}\][^\[]*?)DataType=\w+\n".encode(), rb"\1", text))
+        objects = read_makers_objects(str(path))
+        assert objects.rows[int(index, 16), 0].type == kind
+        assert f"0x{index}:00 is {kind} by the standard: the file has no type for it" in objects.assumed
+        assert f"{index}sub0: no DataType" in assumptions_of(str(path))[0]

@@ -18,7 +18,7 @@ from pmsmtool.data_types import BY_SHORT
 from pmsmtool.drive_maps.eds import NODE_ID_WORD, decode, parse_eds, parse_integer, parse_real, without_remark
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import read_bytes
-from pmsmtool.sim.node.objects import ObjectRow
+from pmsmtool.sim.node.objects import ObjectRow, object_rows
 
 FAMILY_MARK = "#"
 """Between the path of a table and the family whose rows are meant: ``objects.csv#maker``."""
@@ -267,6 +267,12 @@ def _completed(
                 found[index, sub] = _row(index, sub, "mandatory", kind, access, value, None, None)
                 assumed.append(f"0x{index:04X}:{sub:02X} {why}")
 
+    for standard in object_rows():  # by the types that the reference drive has of CiA 301 and CiA 402
+        at = standard.index, standard.sub
+        row = found.get(at) if not 0x2000 <= standard.index < 0x6000 else None
+        if row is not None and row.type == "DOMAIN" and standard.data_type.is_integer:
+            found[at] = replace(row, type=standard.type, default=_value(row.default, standard.type))
+            assumed.append(f"0x{at[0]:04X}:{at[1]:02X} is {standard.type} by the standard: the file has no type for it")
     for index, sub, kind, _, value in MANDATORY:
         row = found.get((index, sub))
         if row is not None and not row.data_type.is_integer:
