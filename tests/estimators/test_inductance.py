@@ -25,6 +25,9 @@ from pmsmtool.estimators.injection.output_error import AxisModel
 from pmsmtool.estimators.injection.sampling_instant import INSTANTS, LAGS, ShownInstant
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise
+from pmsmtool.identification.evaluate import Evaluation
+from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.value_verdict import warnings_of
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, Run, curve_points, draw, repeat, run
 
@@ -40,6 +43,12 @@ SUBSTEPS = 10
 """Midpoint steps per period; with 20 the largest error of ``test_ideal_sensors`` is 1.8e-3, with these 1.1e-3."""
 DRIVES = 3
 """Of the population; ``benchmarks/identification_coverage.py`` draws any number."""
+
+
+BEND_TOLERANCE = 0.1
+"""Of the change of L_d per current at the bias, measured 0.033: the fit stops at the third power."""
+NOISE = Noise(0.0, 0.0, 0.0)
+ASKED = IdentifyRequest(("L",))
 
 
 class Shots:
@@ -138,13 +147,30 @@ def test_unknown_sensor_lag_and_late_sampling() -> None:
     assert np.max(np.abs(np.array(seen) - true) / drives.T_s) < 0.05
 
 
-def test_a_bend_is_not_taken_for_an_inductance() -> None:
+@pytest.fixture(scope="module")
+def bent() -> Shots:
     rng = np.random.default_rng(23)
     drives = draw(1, rng)
     drives.bend[:] = 0.4 / drives.I_r
-    errors, _, results = errors_of(Shots(drives, rng))
+    return Shots(drives, rng)
+
+
+def test_a_bend_is_not_taken_for_an_inductance(bent: Shots) -> None:
+    errors, _, results = errors_of(bent)
     assert np.quantile(errors[::2], 0.9) < 2.5e-3  # the d axis, measured 1.6e-3
     assert all("bend" in result.axes["d"].effects for result in results)
+
+
+def test_a_bend_is_told_with_its_size(plain: Shots, bent: Shots) -> None:
+    """A machine whose L_d falls by 29 % up to its rated current passed as one of a single L_d, without a word."""
+    b, i = float(bent.drives.bend[0]), bent.mean_i_d(0)
+    found = bent.estimate(0)
+    true = -b / (1.0 + 2.0 * b * i)  # of L_inc = L_d/sqrt(1 + 2 b i)
+    assert found.axes["d"].bend_per_a == pytest.approx(true, rel=BEND_TOLERANCE)
+    (said,) = warnings_of(Evaluation(NOISE, inductance=found), ASKED)
+    assert said.startswith("L_d changes by -29 % from i_d = 0 to ") and "commission --flux-map" in said
+    for k in range(plain.drives.n):
+        assert warnings_of(Evaluation(NOISE, inductance=plain.estimate(k)), ASKED) == []
 
 
 def test_a_free_rotor_follows_the_injection() -> None:

@@ -95,6 +95,8 @@ class AxisFit:
         Information weight, delay (T_s) and lag (s) of every model that counts.
     eddy_s, eddy_tau_s : float
         Eddy currents of the best model, per voltage and 1/L (s), and their time constant; 0 where it has none.
+    bend_per_a : float
+        Relative change of the incremental inductance per current of the axis at the bias, by the best model (1/A).
     """
 
     L_h: float
@@ -114,6 +116,7 @@ class AxisFit:
     places: tuple[tuple[float, float, float], ...] = ()
     eddy_s: float = 0.0
     eddy_tau_s: float = 1.0
+    bend_per_a: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -367,4 +370,5 @@ def _average(
         ),
         eddy_s=first.model.eddy_s * first.model.flux_inductance_h / first.model.L_h,
         eddy_tau_s=first.model.eddy_tau_s,
+        bend_per_a=-2.0 * first.c_2,
     )
