@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,8 @@ NODES = 41
 TURNS_LEAST = 4
 """Turns of the voltage on every axis it acts on: two whole cycles."""
 KNOWN_SHARE = 0.005
-"""Largest standard deviation of a flux that counts as identified, of the flux range."""
+"""Largest standard deviation of a flux that counts as identified, of the flux range; without the magnet's, which is
+judged as psi_f."""
 COVERED_SHARE = 0.99
 """Nodes of a disc that must be identified for the disc to count."""
 RADII = (1.0, 0.97, 0.94, 0.91, 0.88, 0.85, 0.8)
@@ -192,6 +193,8 @@ def estimate_flux_map(
     i_d, i_q = (grid.ravel() for grid in np.meshgrid(axis_d, axis_q, indexing="ij"))
     shape = (len(axis_d), len(axis_q))
     psi, std = fit.flux(i_d, i_q), fit.flux_std(i_d, i_q)
+    # the magnet's flux is not the pulses': what is open of it says nothing of where they went
+    shown = replace(fit, magnet_std_wb=0.0).flux_std(i_d, i_q)
     inside = np.hypot(i_d, i_q) <= RADII[-1] * i_max
     span = float(np.max(np.ptp(psi[:, inside], axis=1)))
     misfit = fit.misfit_a * float(np.median(np.max(fit.inductance(i_d[inside], i_q[inside])[[0, 2]], axis=0))) / span
@@ -202,8 +205,8 @@ def estimate_flux_map(
             stage=STAGE,
             likely="an encoder that does not follow the rotor, a wrong number of pole pairs, or eddy currents",
         )
-    radius, psi = _supported(fit, axis_d, axis_q, std, span, i_max)
-    known = (np.hypot(i_d, i_q) <= radius) & np.all(std <= KNOWN_SHARE * span, axis=0)
+    radius, psi = _supported(fit, axis_d, axis_q, shown, span, i_max)
+    known = (np.hypot(i_d, i_q) <= radius) & np.all(shown <= KNOWN_SHARE * span, axis=0)
     L = np.where(known, fit.inductance(i_d, i_q), math.nan)
     skew = _skew(fit, radius) / span
     psi[0] += to_reference_wb
