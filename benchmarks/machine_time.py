@@ -16,17 +16,17 @@ half widths in percent, the largest of the drives; R at the temperature of the m
     0.01       31.1    34.0        0.16   0.13   0.13           0.45   0.36   0.32    60 of 60
 
 Both shares get the least effort, which leaves twice the accuracy of 1 %. What is left is no matter of how much is
-collected. Of 31.8 s of ``interior-2k2``: dead-man and noise 1.2, phases and current limit 3.2, first turn 0.9, levels
-5.4, pairs of phases 2.1, slow turn 4.2, square waves 4.3, pushes and speed limit 2.6, speeds 4.8, mechanics 2.9.
+collected: the seconds by experiment are printed, too.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -48,22 +48,47 @@ from pmsmtool.measurement.identify import identify
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 
-NAMES = (R_MEASURED, "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2")
+NAMES = (R_MEASURED, "L_d_h", "L_q_h", "psi_f_wb", "J_kgm2", "B_nms", "tau_c_nm")
 Row = dict[str, Any]
 
 
-def identified(drive_file: MachineFile, accuracy: float | None, folder: Path) -> tuple[Stage, dict[str, float]]:
-    """Identify a simulated drive; return the stage and the standard deviations that were predicted (1)."""
+EXPERIMENTS = {
+    "noise": "noise",
+    "phases": "phases, current limit, first turn",
+    "R and inverter": "levels",
+    "pairs": "pairs of phases",
+    "pole pairs": "slow turn",
+    "L_d, L_q": "square waves",
+    "flux and inertia": "pushes, speed limit",
+    "psi_f": "speeds",
+    "J, B, tau_c": "mechanics",
+}
+"""Experiments by the beginning of what is said of them."""
+
+
+def identified(
+    drive_file: MachineFile, accuracy: float | None, folder: Path
+) -> tuple[Stage, dict[str, float], dict[str, float]]:
+    """Identify a simulated drive; return stage, predicted standard deviations (1) and seconds by experiment (s)."""
     path = folder / "drive.toml"
     path.write_text(dump_machine_file(drive_file), encoding="utf-8")
     run = RunDirectory.create(folder, 1, new_record(["benchmark"], drive={}, bus={}, versions={}))
     with connect("pmsmsim", f"{path}?nv=:memory:") as connection:
         drive = CanopenDrive(connection, 1)
         request = IdentifyRequest(accuracy=accuracy)
-        stage = identify(run, drive, request, lambda _: None, lambda _: None)
+        clock, spent = connection.clock, defaultdict[str, float](float)
+        experiment, since = "start", connection.clock.now()
+
+        def say(text: str) -> None:
+            nonlocal experiment, since
+            begun = next((name for begin, name in EXPERIMENTS.items() if text.startswith(begin)), experiment)
+            spent[experiment] += clock.now() - since
+            experiment, since = begun, clock.now()
+
+        stage = identify(run, drive, request, lambda _: None, say)
         drive.close()
     entries = json.loads((run.path / PREDICTED).read_text(encoding="utf-8"))["predictions"]
-    return stage, {key: value for entry in entries for key, value in entry["relative_std"].items()}
+    return stage, {key: value for entry in entries for key, value in entry["relative_std"].items()}, dict(spent)
 
 
 def row_of(seed: int, block: str, accuracy: float | None) -> Row:
@@ -77,7 +102,7 @@ def row_of(seed: int, block: str, accuracy: float | None) -> Row:
     row: Row = {"seed": seed, "accuracy": accuracy}
     with tempfile.TemporaryDirectory() as folder:
         try:
-            stage, predicted = identified(drive_file, accuracy, Path(folder))
+            stage, predicted, row["spent"] = identified(drive_file, accuracy, Path(folder))
         except PmsmtoolError as error:
             return {**row, "refused": getattr(error, "reason", type(error).__name__)}
     told = accuracy_told(stage.values).values()
@@ -90,7 +115,7 @@ def row_of(seed: int, block: str, accuracy: float | None) -> Row:
                 "error": value["value"] / truth[name] - 1.0,
                 "statistical": value["statistical_95"] / truth[name],
                 "total": value["total_95"] / truth[name],
-                "predicted": COVERAGE_FACTOR * predicted["R_s_ohm" if name == R_MEASURED else name],
+                "predicted": COVERAGE_FACTOR * predicted.get("R_s_ohm" if name == R_MEASURED else name, math.nan),
             }
     return row
 
@@ -103,6 +128,12 @@ def table(rows: list[Row]) -> str:
         f"{len(done)} of {len(rows)} drives; machine time: median {np.median(times):.1f} s, "
         f"p95 {np.quantile(times, 0.95):.1f} s, largest {np.max(times):.1f} s",
         f"status {dict(Counter(row['status'] for row in done))}, accuracy reached: {sum(r['reached'] for r in done)}",
+        "experiment: median, p95: "
+        + "; ".join(
+            f"{name} {np.median(part):.1f}, {np.quantile(part, 0.95):.1f} s"
+            for name in ("start", *EXPERIMENTS.values())
+            if any(part := [row["spent"].get(name, 0.0) for row in done])
+        ),
         "quantity          error: median      p90      max  in total, statistical 95 %  half width: median     max  "
         "over predicted: median, max",
     ]
@@ -115,7 +146,7 @@ def table(rows: list[Row]) -> str:
             f"{name:17s} {np.median(error):11.3f} % {np.quantile(error, 0.9):6.3f} % {np.max(error):6.3f} %"
             f"  {hits[0]:3d}, {hits[1]:3d} of {len(mine):<3d}"
             f"  {np.median(statistical):24.3f} % {np.max(statistical):6.3f} % "
-            f"{np.median(ratio):6.2f}, {np.max(ratio):.2f}"
+            f"{np.nanmedian(ratio):6.2f}, {np.nanmax(ratio):.2f}"
         )
     return "\n".join(lines)
 
