@@ -329,6 +329,17 @@ def test_friction_that_falls_with_the_speed_is_no_drag(stribeck: float, monkeypa
     assert abs(found.B.value) < 2.0 * found.B.std, "between the models with drag and without lies none"
 
 
+@pytest.mark.chain
+def test_a_friction_that_grows_ever_less_with_the_speed_is_no_drag_that_drives() -> None:
+    """Before, a drag of -0.5 tau_c at this speed, which turned the shaft at three times this speed."""
+    traces = run_of(np.random.default_rng(5))
+    fastest = max(float(np.max(np.abs(np.diff(t["theta_M_rad"])))) / t.period_s for t in traces)
+    found = estimate(with_drag(traces, -0.5 * TAU_C / fastest**2))
+    assert found.drag is None and found.J.value == pytest.approx(J, rel=2e-3), "within 3e-4 seen"
+    for value, true in ((found.B, B), (found.tau_c, TAU_C)):
+        assert abs(value.value - true) < 3.0 * value.std
+
+
 def braked(rng: np.random.Generator, tilt: float = 0.0, friction: float = 0.0, encoder: float = 0.0) -> list[Trace]:
     """A shaft that stops soon: coasting is recorded from a fifth of the speed on, as an upload of the push leaves it.
 
