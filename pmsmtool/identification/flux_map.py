@@ -110,7 +110,7 @@ def map_acceptance(result: FluxMapResult | None) -> list[Acceptance]:
     deviation = result.deviation
     return [
         Acceptance(
-            "flux map: standard deviation of the identified fluxes, of their range",
+            "flux map: standard deviation of the fluxes that currents make, of their range",
             f"{100.0 * deviation:.2g} %",
             f"{100.0 * DEVIATION_LIMIT:.2g} %",
             deviation <= DEVIATION_LIMIT,

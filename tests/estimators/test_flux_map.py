@@ -125,7 +125,7 @@ def test_an_open_magnet_flux_leaves_the_plane_covered() -> None:
     std_wb = 0.02 * known.span_wb  # four times what a flux may be open by to count as identified
     open_ = estimate(pulses(), magnet_std_wb=std_wb)
     assert np.array_equal(open_.identified, known.identified) and open_.radius_a == known.radius_a
-    assert np.all(open_.psi_std_wb[0] >= std_wb)
+    assert np.all(open_.psi_std_wb[0] >= std_wb) and open_.deviation == pytest.approx(known.deviation, rel=1e-6)
 
 
 @pytest.mark.chain

@@ -168,7 +168,7 @@ WIDE: tuple[Row, ...] = ((0x6071, 0, "I32", "rw", "0"), (0x6077, 0, "I32", "ro",
 
 
 def test_a_torque_of_32_bits_is_no_share_where_the_drive_has_no_rated_current(tool: Tool) -> None:
-    """Such drives count mA. They were commanded in permille of the rated current that a name plate gave."""
+    """The file does not say what a count is. They were commanded in permille of the rated current of a name plate."""
     write_eds(Path("x.eds"), unknown("0x2D", *WIDE, without=(0x6075,)))
     code, said, _ = tool("caps", "--eds", "x.eds")
     assert code == 0 and "0x6071, in permille" in said and "in place of ?" not in said

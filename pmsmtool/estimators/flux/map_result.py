@@ -91,8 +91,10 @@ class FluxMapResult:
 
     @property
     def deviation(self) -> float:
-        """Rms standard deviation of the identified fluxes, of the flux range."""
-        return math.sqrt(float(np.mean(np.square(self.psi_std_wb[:, self.identified])))) / self.span_wb
+        """Rms standard deviation of the identified fluxes, of their range; without the magnet's (KNOWN_SHARE)."""
+        variance = np.square(self.psi_std_wb[:, self.identified])
+        variance[0] -= self.fit.magnet_std_wb**2
+        return math.sqrt(float(np.mean(variance))) / self.span_wb
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what the map's own file cannot say, for a ``.npz`` beside it."""
