@@ -370,12 +370,15 @@ def _estimates(fit: Fit, chi2: float) -> dict[str, Estimate]:
 def _inertia(
     fit: Fit, chi2: float, log_weights: tuple[float, ...], scale_std: float, tolerance: SensorTolerance
 ) -> Estimate | None:
-    """Return the inertia whose logarithm is that sum of a fit's parameters; None where the fit is no explanation."""
+    """Return the inertia whose logarithm is that sum of a fit's parameters; None where the fit does not tell it."""
     if not fit.converged or chi2 > CHI2_REFUSE:
         return None
-    weights = np.array(log_weights)
-    covariance, _ = scaled_covariance(fit.jacobian)
-    value = math.exp(float(weights @ fit.x))
+    used = np.flatnonzero(log_weights)
+    weights = np.array(log_weights)[used]
+    covariance = scaled_covariance(fit.jacobian)[0][np.ix_(used, used)]
+    if not np.all(np.isfinite(covariance)):
+        return None
+    value = math.exp(float(weights @ fit.x[used]))
     own = math.sqrt(max(1.0, chi2) * float(weights @ covariance @ weights))
     return Estimate(
         value, value * math.hypot(own, scale_std, INERTIA_FLOOR), tolerance.inertia * value, "kg m2",
