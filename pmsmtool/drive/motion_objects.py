@@ -205,7 +205,7 @@ def undecided(node: DriveNode, rated: float) -> bool:
 def _permille(node: DriveNode, item: DriveObject) -> bool:
     """Whether a torque or current is there and counts permille of the rated one, as CiA 402 has it.
 
-    In 32 bits, of a drive that has no rated current (0x6075) to be a share of, it is the maker's unit: who says which?
+    In 32 bits, of a drive without a rated current (0x6075) to be a share of, nothing states its unit.
     """
     held = node.held(item) is not None
     return held and (node.typed(item).size <= item.size or node.held(objects.RATED_CURRENT_MA) is not None)

@@ -235,8 +235,8 @@ def estimate_mechanics(
         share = max(share, 0.5)
     of_drag, _ = information_bound(with_drag.jacobian)
     # friction that falls with the speed is no viscous one: a drag beside it fits the dip of Stribeck's curve, and is
-    # 76 N m at the rated speed of a shaft with 1 N m of friction; a drag below zero turned a shaft at 4 times the speed
-    # of its pushes by 2.2 N m. Neither model is the shaft's
+    # 76 N m at the rated speed of a shaft with 1 N m of friction; a drag below zero would turn it (2.2 N m, ten times
+    # the friction, at 13 times the speed of the pushes). Neither model is the shaft's
     falls = with_drag.x[1] < -COVERAGE_FACTOR * widen * float(of_drag[1])
     if falls or with_drag.x[SHAFT] < 0.0:
         share = min(share, 0.5)
