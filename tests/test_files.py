@@ -73,6 +73,18 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
     assert path.read_text() == "old" and [found.name for found in tmp_path.iterdir()] == ["out"]
 
 
+def test_what_must_last_is_on_the_disk_before_it_takes_the_name_and_the_name_after(tmp_path, monkeypatch):
+    done = []
+    for name in ("fsync", "replace"):
+        real = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *given, name=name, real=real: (done.append(name), real(*given))[1])
+    write_file(tmp_path / "a.toml", "a")
+    assert done == ["replace"]
+    done.clear()
+    write_file(tmp_path / "a.toml", "b", synced=True)
+    assert done == ["fsync", "replace", "fsync"]
+
+
 def test_the_usual_rights_of_a_new_file_are_kept(tmp_path):
     (tmp_path / "usual").touch()
     write_file(tmp_path / "ours", b"")
