@@ -83,6 +83,8 @@ REFUSED_AS = {
     ),
 }
 """What of the pulses takes every number along: the name of the refusal, and the next step."""
+TAKES_ALL = {name for name, _ in REFUSED_AS.values()}
+BY_PUSH = "J_per_psi, psi_f_wb"
 UNDECIDED = (
     "no source says whether this drive's amperes are peak or rms: the interval holds for both; a map of your own may "
     "say it (rated_current)"
@@ -143,6 +145,8 @@ class PulseFacts:
         What is said of a current limit that was not proven.
     no_vector : str
         Why no vector was turned, where the drive announces that it can be.
+    no_push : str
+        Why the pushes told nothing, where something else was measured.
     """
 
     kind: Method
@@ -159,6 +163,7 @@ class PulseFacts:
     current_undecided: bool = False
     limit: str = ""
     no_vector: str = ""
+    no_push: str = ""
 
 
 def pulse_result(
@@ -208,10 +213,20 @@ def pulse_result(
     missing: dict[str, str] = {}
     if facts.pushed:
         pole_pairs = round(estimates["pole_pairs"].value) if "pole_pairs" in estimates else facts.pole_pairs
-        pushed, missing = _by_torque(traces, replace(facts, pole_pairs=pole_pairs), tolerance, inverter, psi_f_wb)
+        try:
+            pushed, missing = _by_torque(traces, replace(facts, pole_pairs=pole_pairs), tolerance, inverter, psi_f_wb)
+        except IdentificationError as error:
+            if not estimates or error.reason in TAKES_ALL:
+                raise
+            pushed, missing = {}, {BY_PUSH: why_no_push(error)}
         estimates |= pushed
         missing = {name: why for name, why in missing.items() if name not in estimates}
     return PulseResult(estimates, missing | ({"offset_rad": facts.no_vector} if facts.no_vector else {}))
+
+
+def why_no_push(error: IdentificationError) -> str:
+    """Return why the pushes told nothing."""
+    return f"{error.what} (likely {error.likely})" if error.likely else error.what
 
 
 def _by_recorder(
@@ -375,7 +390,7 @@ def evaluated_stage(
     if facts.no_vector and known is not None:  # as given, like everything that is not measured
         asked = tuple(name for name in asked if name not in BY_ANGLE)
     if {"psi", "mechanics"} & set(asked) and facts.kind == Method.STANDARD and not facts.pushed:
-        result = replace(result, missing={**result.missing, "J_per_psi, psi_f_wb": NO_POLE_PAIRS})
+        result = replace(result, missing={**result.missing, BY_PUSH: facts.no_push or NO_POLE_PAIRS})
     if not any(set(TOLD_BY.get(name, ())) & set(result.estimates) for name in asked):
         reasons = [f"{name}: not available: {why}" for name, why in result.missing.items()]
         raise NotAvailable("\n  - ".join(["nothing that was asked for was identified", *reasons]), where=str(run.path))

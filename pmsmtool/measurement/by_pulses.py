@@ -38,6 +38,7 @@ from pmsmtool.experiments.shaft_answer import ShaftAnswer
 from pmsmtool.experiments.supply_levels import LEVELS, hold_supply_levels
 from pmsmtool.experiments.vector_turn import lead_onto_vector
 from pmsmtool.identification.by_pulses import (
+    BY_PUSH,
     FACTS,
     NO_POLE_PAIRS,
     SUPPLY_LEVELS,
@@ -45,6 +46,7 @@ from pmsmtool.identification.by_pulses import (
     Voltage,
     dump_facts,
     evaluated_stage,
+    why_no_push,
 )
 from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.machine.machine_file import MachineFile
@@ -334,6 +336,11 @@ def measure_polled(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Puls
         try:
             pushed = push_by_torque(pushing, envelope, keep, say)
             facts = replace(pushed, pole_pairs=facts.pole_pairs, no_vector=facts.no_vector)
+        except IdentificationError as error:
+            if not {SUPPLY_LEVELS, "rotation_backward"} & set(names):
+                raise
+            facts = replace(facts, no_push=why_no_push(error))
+            say(f"{BY_PUSH}: not available: {facts.no_push}")
         finally:
             drive.may_be_energised = drive.may_be_energised or pushing.may_be_energised
             pushing.close()

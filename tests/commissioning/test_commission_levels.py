@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
@@ -30,10 +31,11 @@ from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
-from pmsmtool.errors import ConfigError, Contradiction, ExitCode, NotAvailable
+from pmsmtool.errors import ConfigError, Contradiction, ExitCode, IdentificationError, NotAvailable
 from pmsmtool.identification.replay import replay
 from pmsmtool.identification.run_files import REPLAYED
 from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.measurement import by_pulses
 from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, examine
 from pmsmtool.measurement.identify import SET_UP, open_for_level
 from pmsmtool.papers.closed_drive import ClosedNode
@@ -379,13 +381,15 @@ def test_what_a_drive_lacks_is_said_before_a_consent_and_leads_on(
     assert all(stage["note"] for stage in stages.values() if stage["status"] == "not available")
 
 
-def test_a_measurement_that_is_not_accepted_says_what_to_change(
+def test_a_measured_contradiction_says_what_to_change_also_where_no_push_succeeds(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     text = PROFILE.read_text(encoding="utf-8").replace("pole_pairs = 3", "pole_pairs = 4")
     Path("wrong.toml").write_text(text, encoding="utf-8")
     channel = "interior-2k2?nv=:memory:&drive=cia402"
+    unmoved = IdentificationError("E_EXCITATION", "the shaft does not answer", likely="it is held")
+    monkeypatch.setattr(by_pulses, "push_by_torque", Mock(side_effect=unmoved))
     with PmsmSimBus(channel):  # the drive stays powered when the tool leaves
         outcome = CliRunner().invoke(cli, ["-i", "pmsmsim", "-c", channel, "commission", "wrong.toml", "--yes"])
         with Connection(PmsmSimBus(channel)) as connection:
@@ -395,6 +399,10 @@ def test_a_measurement_that_is_not_accepted_says_what_to_change(
     (run,) = Path("runs").iterdir()
     assert verdict(run).word == "FAIL"
     assert "--resume" not in outcome.stderr and "begin a new run" in outcome.stderr
+    # the push, which tells nothing here, does not take what the turns told along
+    stage = RunDirectory(run).read().stage("identify")
+    assert stage is not None and list(stage.refused) == ["psi", "mechanics"]
+    assert all("the shaft does not answer (likely it is held)" in why for why in stage.refused.values())
 
 
 def test_a_map_with_every_gain_says_what_a_proof_lacks_besides(tmp_path: Path) -> None:

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import math
+from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -73,6 +75,26 @@ def test_an_inertia_that_is_too_wide_leaves_the_flux_linkage(monkeypatch: pytest
     assert set(result.estimates) == {"psi_f_wb"} and result.missing["J_per_psi"].startswith("E_NOT_IDENTIFIABLE: J/psi")
     refused = judged(result.estimates, result.missing, ("mechanics",), None).verdicts.refused["mechanics"]
     assert refused.startswith("E_NOT_IDENTIFIABLE"), "the reason stands once"
+
+
+def test_what_the_turns_told_stays_where_no_push_tells_anything(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An open phase takes them along: no vector turned as it was asked to."""
+    turned = {"pole_pairs": Estimate(7.0, 0.0, 0.0, "1")}
+    monkeypatch.setattr(by_pulses, "estimate_encoder", lambda forward, backward: None)
+    monkeypatch.setattr(by_pulses, "encoder_estimates", lambda found, traces: turned)
+    traces: Any = {"rotation_forward": None, "rotation_backward": None}
+    monkeypatch.setattr(by_pulses, "calibrated_traces", lambda traces, tolerance: traces)
+    facts = PulseFacts(Method.STANDARD, pushed=True)
+    for reason, kept in (("E_EXCITATION", True), ("E_PHASE_OPEN", False)):
+        pushed = Mock(side_effect=IdentificationError(reason, "no push", likely="a held shaft"))
+        monkeypatch.setattr(by_pulses, "_by_torque", pushed)
+        if kept:
+            result = pulse_result(traces, facts)
+            assert result.estimates == turned
+            assert result.missing == {by_pulses.BY_PUSH: f"{reason}: no push (likely a held shaft)"}
+        else:
+            with pytest.raises(IdentificationError, match=reason):
+                pulse_result(traces, facts)
 
 
 @pytest.mark.parametrize(("share", "named"), [(0.13, "13 % of what was asked for flowed"), (0.95, "bare shaft")])
