@@ -28,8 +28,8 @@ MAP_INTERVALS = "flux_map_intervals.npz"
 HELD_FALLBACK = "psi_f of the drive's parameter set: a held rotor shows increments of flux only"
 CORRECTION_STD = 0.2
 """Standard deviation of what the map takes psi_f back to zero current by, of that correction: its curvature there."""
-DEVIATION_LIMIT = 0.005
-"""Largest rms deviation of the identified fluxes, of their range. Measured: 0.0006."""
+DEVIATION_LIMIT = 0.003
+"""Largest rms deviation of all fluxes within the map's current, of their range."""
 
 
 def flux_map_of(

@@ -121,6 +121,8 @@ class CoenergyFit:
         The angles used.
     magnet_std_wb : float
         Standard deviation of the flux at zero current (Wb).
+    unphysical_wb : float
+        Rms of what the pulses show and no machine has (Wb), as a deviation of every flux.
     """
 
     spline: CoenergySpline
@@ -136,6 +138,7 @@ class CoenergyFit:
     skew: FittedSkew
     frame: Frame
     magnet_std_wb: float
+    unphysical_wb: float = 0.0
 
     def flux(self, i_d_a: Array, i_q_a: Array) -> Array:
         """Return psi_d, psi_q (Wb), shape (2, n)."""
@@ -151,11 +154,12 @@ class CoenergyFit:
         return self.sigma_a * math.sqrt(max(0.0, self.chi2 - 1.0))
 
     def flux_std(self, i_d_a: Array, i_q_a: Array) -> Array:
-        """Return the standard deviations of psi_d, psi_q (Wb), shape (2, n): of the fit, and its misfit as flux."""
+        """Return the standard deviations of psi_d, psi_q (Wb), shape (2, n): of the fit, and its misfits as flux."""
         fitted = np.stack([self._std(i_d_a, i_q_a, 1, 0), self._std(i_d_a, i_q_a, 0, 1)])
         L_dd, L_dq, L_qq = self.inductance(i_d_a, i_q_a)
         misfit = self.misfit_a * np.stack([np.hypot(L_dd, L_dq), np.hypot(L_dq, L_qq)])
-        return np.asarray(np.sqrt(fitted**2 + misfit**2 + np.array([[self.magnet_std_wb], [0.0]]) ** 2))
+        apart = self.unphysical_wb**2 + np.array([[self.magnet_std_wb], [0.0]]) ** 2
+        return np.asarray(np.sqrt(fitted**2 + misfit**2 + apart))
 
     def inductance_std(self, i_d_a: Array, i_q_a: Array) -> Array:
         """Return the standard deviations of L_dd, L_dq, L_qq (H), shape (3, n).
