@@ -34,6 +34,7 @@ from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.measurement.by_injection import envelope_of, nameplate_of
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
+from pmsmtool.measurement.shaft_forecast import ShaftForecast
 from pmsmtool.resources import data_folder
 from pmsmtool.sim.simulated_machine import settings_of, with_simulation
 from pmsmtool.trace import Trace
@@ -56,7 +57,9 @@ saturated-pmsyrm without its map 7.2, and 14.3 where other records before it dre
 
 
 @pytest.mark.parametrize(("name", "seed"), [("fast-ipm", 1), ("saturated-pmsyrm", 2)])
-def test_the_inertia_is_right_where_i_d_does_not_stay_zero(name: str, seed: int, tmp_path: Path) -> None:
+def test_the_inertia_is_right_where_i_d_does_not_stay_zero(
+    name: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The slow current loop of the runs lets i_d rise in a push: on fast-ipm a fifth of the torque is reluctance."""
     profiles = data_folder("profiles")
     drive_file = with_simulation(load_machine_file(profiles / f"{name}.toml"), {"seed": seed, "psi_6_wb": FIFTH_WB})
@@ -66,8 +69,16 @@ def test_the_inertia_is_right_where_i_d_does_not_stay_zero(name: str, seed: int,
     traces: dict[str, Trace] = {}
     said: list[str] = []
     predictions: list[dict[str, Any]] = []
+    computed_off: list[bool] = []
+    compute = ShaftForecast.mechanics
     with connect("pmsmsim", f"{path}?nv=:memory:") as connection:
         drive = CanopenDrive(connection, 1)
+
+        def watched(self: ShaftForecast, plan: MechanicsPlan) -> dict[str, float]:
+            computed_off.append(not drive.may_be_energised)
+            return compute(self, plan)
+
+        monkeypatch.setattr(ShaftForecast, "mechanics", watched)
         nameplate = nameplate_of(drive, name)
         envelope = envelope_of(nameplate, IdentifyRequest())
         I_nom = nameplate.machine.I_nom_apk or envelope.i_max_apk
@@ -94,6 +105,7 @@ def test_the_inertia_is_right_where_i_d_does_not_stay_zero(name: str, seed: int,
         assert error < 2.0 * statistical_half_width(found[key]), key
     pushes = said.index(next(line for line in said if line.startswith("J, B, tau_c: torque pulses")))
     assert said[pushes + 1].startswith("predicted standard deviation: J ")
+    assert computed_off == [True], "a slow computer sends no heartbeat meanwhile, and the drive would trip"
     first, last = predictions
     assert first["later"] == ["J, B, tau_c"] and last["before"] == "mechanics"
     for key in LIMIT:
