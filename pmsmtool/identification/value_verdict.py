@@ -128,6 +128,13 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
             for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
             if error > 0.0
         ]
+    if evaluation.mechanics is not None and evaluation.mechanics.harmonics.line_rad:
+        once = evaluation.mechanics.harmonics.line_rad[0]
+        error_rad = max(h.amplitude for h in evaluation.mechanics.harmonics.line_rad)
+        lines.append(
+            f"the encoder is off by {math.degrees(error_rad):.2g} deg (mechanical) within each of {once.order} lines: "
+            "offset or amplitude of its sine and cosine? A slow speed loop follows it"
+        )
     flux = evaluation.flux
     if flux is not None and flux.psi_f.systematic > NOTABLY_WIDER * flux.psi_measured.systematic:
         lines.append(
@@ -204,6 +211,9 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         if evaluation.mechanics.unexplained and not evaluation.mechanics.J.fallback:
             conditions[TORQUE_NOISE] = evaluation.mechanics.ripple
         errors_rad |= {h.order: h.amplitude for h in evaluation.mechanics.harmonics.encoder_rad}
+        for name, h in zip(("line", "line_twice"), evaluation.mechanics.harmonics.line_rad, strict=False):
+            conditions[f"encoder_{name}_rad"] = h.amplitude
+            conditions.setdefault("encoder_lines", h.order)
     often = dict(zip(ENCODER_ORDERS, ("once", "twice"), strict=True))
     conditions |= {f"encoder_{often[order]}_rad": error_rad for order, error_rad in errors_rad.items()}
     if evaluation.cogging is not None and evaluation.cogging.harmonics.acceleration_rad_s2:

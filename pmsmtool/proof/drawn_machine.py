@@ -195,7 +195,9 @@ def _draw_elastic_shaft(setup: Setup, machine: MachineFile, rng: np.random.Gener
 def _draw_shaft_effects(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
     """Draw what was identified along the shaft: drag, largest order of the cogging, errors and noise of the encoder."""
     out, seen = setup.machine, machine.conditions
-    for name in ("encoder_once", "encoder_twice"):
+    if isinstance(lines := seen.get("encoder_lines"), int):
+        setup.sensors.encoder_lines = float(lines)
+    for name in ("encoder_once", "encoder_twice", "encoder_line", "encoder_line_twice"):
         if isinstance(error_rad := seen.get(f"{name}_rad"), float):
             setattr(setup.sensors, name, float(rng.uniform(*SEEN_SHARES)) * error_rad)
     if isinstance(noise_rad := seen.get("encoder_noise_rad"), float):

@@ -114,6 +114,12 @@ double pmsm_sensor_angle(const pmsm_sensor_setup *setup, pmsm_random *random, do
         pmsm_real64_sincos(PMSM_REAL64_TWO_PI * turn, &s, &c);
         theta += setup->encoder_once * s + setup->encoder_twice * 2.0 * s * c;
     }
+    if (setup->encoder_line != 0.0 || setup->encoder_line_twice != 0.0) {
+        double s, c, line = setup->encoder_lines * theta_M / PMSM_REAL64_TWO_PI;
+        line -= nearest(line);
+        pmsm_real64_sincos(PMSM_REAL64_TWO_PI * line, &s, &c);
+        theta += setup->encoder_line * s + setup->encoder_line_twice * 2.0 * s * c;
+    }
     if (setup->encoder_noise > 0.0)
         theta += setup->encoder_noise * pmsm_random_normal(random);
     if (setup->encoder_reversed)

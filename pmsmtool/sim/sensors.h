@@ -22,6 +22,8 @@ typedef struct {
     uint32_t fault;              /* enum pmsm_sensor_fault */
     double encoder_latency;      /* s */
     double encoder_once, encoder_twice; /* rad mechanical: error amplitudes per turn and per half turn */
+    double encoder_line, encoder_line_twice; /* rad mechanical: error amplitudes per line and per half line */
+    double encoder_lines;        /* lines of the encoder per turn, between which it interpolates */
     double encoder_noise;        /* rad mechanical rms, white, before the grid */
     double T_lag;                /* s, of the temperature sensor, 0: none */
     double blind;                /* s: shortest low-side pulse a shunt can read, 0: in-phase sensors */

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -94,3 +94,31 @@ def test_friction_over_the_angle_hides_no_cogging() -> None:
     assert sum(h.amplitude for h in found.encoder_rad) < 6e-6  # measured 3.2e-6; friction moves the shaft by 1.9e-4
     (order,) = found.acceleration_rad_s2
     assert order.order == 18 and order.amplitude == pytest.approx(12.0, rel=0.1)
+
+
+LINE_TOLERANCE = 0.05
+"""Relative, of an interpolation's error; measured: 0.017 and 0.032."""
+
+
+def braked(error: Callable[[Array], Array], step: float) -> list[tuple[Array, Array]]:
+    """Two shafts that slow down evenly, as an encoder shows them."""
+    t = RATE_S * np.arange(ROWS)
+    ways = [0.3 + start * t - 0.5 * slope * t * t for start, slope in ((65.0, 40.0), (-70.0, -45.0))]
+    return [(t, step * np.floor((way + error(way)) / step)) for way in ways]
+
+
+def test_the_error_of_an_interpolation_is_found_with_its_lines() -> None:
+    """At its first speed a row is 11 lines after the other: the falling speed tells the lines from their aliases."""
+    lines, once, twice = 1024, 2e-4, 8e-5
+    traces = braked(lambda way: once * np.sin(lines * way) + twice * np.cos(2 * lines * way + 0.7), STEP)
+    found = angle_harmonics([(t, shown, position_std(shown, STEP)) for t, shown in traces], STEP)
+    assert [h.order for h in found.line_rad] == [lines, 2 * lines]
+    assert [h.amplitude for h in found.line_rad] == pytest.approx([once, twice], rel=LINE_TOLERANCE)
+    assert not found.encoder_rad and not found.acceleration_rad_s2
+
+
+def test_the_steps_of_a_position_are_no_lines() -> None:
+    step = 2.0 * math.pi / 2**12
+    traces = braked(lambda way: 0.0 * way, step)
+    assert not angle_harmonics([(t, shown, position_std(shown, step)) for t, shown in traces], step).line_rad
+    assert not found_in(traces, step).line_rad  # nor where the step is not known

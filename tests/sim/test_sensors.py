@@ -175,6 +175,15 @@ def test_encoder_grid_errors_and_latency():
     expected = true - omega * latency + once * np.sin(true) + twice * np.sin(2.0 * true)
     assert np.abs(seen - expected).max() < 2e-5  # binary32 at 12 rad
 
+    def interpolating(setup: Setup) -> None:
+        change(setup)
+        with_sensors(encoder_lines=500.0, encoder_line=2e-4, encoder_line_twice=-1e-4)(setup)
+
+    within = open_simulation(interpolating)
+    within.run(1)
+    error = record(within, [THETA_M], 4000)[0] - seen
+    assert np.abs(error - 2e-4 * np.sin(500.0 * true) + 1e-4 * np.sin(1000.0 * true)).max() < 2e-5
+
     def noisy(setup: Setup) -> None:
         change(setup)
         setup.sensors.encoder_noise = 1e-3

@@ -195,7 +195,7 @@ def estimate_mechanics(
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
     step = encoder_step([run["theta_M_rad"] for run in runs])
     coasted = [(run.t_s, direction * run["theta_M_rad"]) for run in runs if run.meta["coasting"]]
-    harmonics = angle_harmonics([(t_s, theta, position_std(theta, step)) for t_s, theta in coasted])
+    harmonics = angle_harmonics([(t_s, theta, position_std(theta, step)) for t_s, theta in coasted], step)
     coasting = {h.order: h for h in harmonics.encoder_rad}
     prior = [replace(coasting.get(h.order, h), std=h.std) for h in encoder_prior(encoder, pole_pairs)]
     known = replace(harmonics, encoder_rad=tuple(prior))
