@@ -49,6 +49,8 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     acceptance = value_verdict.acceptance_of(evaluation, found, designed, request.quantities)
     had = value_verdict.had_of(evaluation)
     verdicts = verdicts_of(request.quantities, evaluation.refused, had, acceptance)
+    tried = evaluation.flux_map is not None or "map" in evaluation.refused
+    unasked = ("map",) if tried and "map" not in request.quantities else ()
     if not verdicts.accepted:
         evaluation.whole()
     rejected = {key for key, line in acceptance.items() if not line.ok}
@@ -86,7 +88,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         values=[*facts, *map(value_verdict.check_facts, evaluation.checks)],
         # what is refused is no criterion of the values that go on
         acceptance=[line for line in acceptance.values() if line.ok or verdicts.status == "fail"],
-        fallbacks=[*verdicts.lines(), *fallen],
+        fallbacks=[*verdicts.lines(), *verdicts_of(unasked, evaluation.refused, had, acceptance).lines(), *fallen],
         files={**files, NAMEPLATE: "", REQUEST: "", **{f"traces/{path.name}": "" for path in trace_files(run)}},
         note="; ".join(
             [*([accuracy_line(accuracy)] if missed else []), *value_verdict.warnings_of(evaluation, request)]

@@ -41,9 +41,10 @@ TOLD_BY: Mapping[str, tuple[str, ...]] = {
 """Keys of the estimates of which one answers for a quantity."""
 NOT_TOLD = "E_NOT_MEASURED"
 BEND_NOTED = 0.15
-"""Relative change of L_d from no current to twice the bias (the rated current) that is said of a machine without a flux
-map: a step to half of that current then meets a mean L_d 4 % off, which is what a predicted band leaves the loop's gain
-(a machine of 41 % failed its proof with a gain 11 % off, one of 28 % passed it)."""
+"""Relative change of L_d from no current to twice the bias (the rated current) from which on a flux map is due, and
+which is said of a machine without one: a step to half of that current then meets a mean L_d 4 % off, which is what a
+predicted band leaves the loop's gain (a machine of 41 % failed its proof with a gain 11 % off, one of 28 % passed it).
+"""
 
 
 def acceptance_of(
@@ -152,22 +153,21 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
         dependent = ", ".join(inductance.frequency_dependent)
         lines.append(f"L: {'depends on frequency on ' + dependent if dependent else 'chi-square above its limit'}")
     if inductance is not None and evaluation.flux_map is None:
-        lines += _bend_note(inductance)
+        lines += _bend_note(inductance, tried="map" in evaluation.refused)
     if evaluation.flux_map is not None:
         lines += evaluation.flux_map.notes
     return [*lines, *filter(None, [frequency_response.response_note(evaluation.frequency_response)])]
 
 
-def _bend_note(inductance: InductanceResult) -> list[str]:
+def _bend_note(inductance: InductanceResult, *, tried: bool) -> list[str]:
     """Say that one L_d is not the machine's: the run over speeds shows it where its flux is not small beside psi_f."""
-    bias = inductance.L_d.i_d_apk
-    change = 2.0 * bias * inductance.axes["d"].bend_per_a
+    i_d_a = 2.0 * inductance.L_d.i_d_apk
+    change = inductance.d_change(i_d_a)
     if not abs(change) >= BEND_NOTED:
         return []
-    return [
-        f"L_d changes by {100.0 * change:+.2g} % from i_d = 0 to {2.0 * bias:.3g} A: the machine saturates, and a "
-        "design with one L_d does not know it; `commission --flux-map` designs with its flux map"
-    ]
+    what = f"L_d changes by {100.0 * change:+.2g} % from i_d = 0 to {i_d_a:.3g} A: the machine saturates, and a "
+    hint = "" if tried else "; `commission --flux-map` designs with its flux map"
+    return [f"{what}design with one L_d does not know it{hint}"]
 
 
 def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str, Any]:

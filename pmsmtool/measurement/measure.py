@@ -34,11 +34,12 @@ from pmsmtool.experiments.current_limit import (
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.experiments.vector_turn import RAMP_S
-from pmsmtool.identification.evaluate import flux_of, resistance_of, tolerance_on
+from pmsmtool.identification.evaluate import Evaluation, flux_of, inductance_of, resistance_of, tolerance_on
 from pmsmtool.identification.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
 from pmsmtool.identification.request import steps_of
 from pmsmtool.identification.run_files import entry
+from pmsmtool.identification.value_verdict import BEND_NOTED
 from pmsmtool.identification.wiring import supply_power
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import flux_map, frequency_response, mechanics, shaft_forecast
@@ -175,7 +176,7 @@ class Measurement:
         turned = False
         if resistance is not None and encoder is not None:
             turned = self._driven(noise, resistance, encoder, steps)
-        mapped = "map" in steps or (turned and self.map_if_saturated and self._saturates(resistance))
+        mapped = "map" in steps or (turned and self.map_if_saturated and self._saturates(noise, resistance, encoder))
         if resistance is not None and mapped and (self.held or turned):
             known = resistance
             self._attempt(
@@ -218,21 +219,34 @@ class Measurement:
             self._shaft(noise, resistance, encoder, steps)
         return ran
 
-    def _saturates(self, resistance: ResistanceResult | None) -> bool:
-        """Whether the run over speeds shows a d axis that saturates so far that a flux map is due; said if so."""
-        if resistance is None:
+    def _saturates(self, noise: Noise, resistance: ResistanceResult | None, encoder: EncoderResult | None) -> bool:
+        """Whether a flux map is due, and said so: by the flux of d currents beside psi_f, or by what L_d changes.
+
+        Where L I is small beside psi_f only the square waves show it; deep saturation of q, which holds the vector's
+        bias low, shows in the flux alone.
+        """
+        if resistance is None or encoder is None:
             return False
-        try:
+        I_nom = self.limits.I_nom_apk
+
+        def changes() -> tuple[float, float]:
             flux = self._flux(resistance)
+            known = Evaluation(noise, resistance=resistance, encoder=encoder, flux=flux)
+            return flux.curvature, inductance_of(self._kept, known, self._tolerance()).d_change(I_nom)
+
+        try:
+            curvature, change = self._computed(changes)
         except IdentificationError:
+            self.drive.enable()
             return False  # the evaluation says so
-        if abs(flux.curvature) < SATURATED:
-            return False
-        self.say(
-            f"the machine saturates: d currents change the flux of their mean by {100.0 * flux.curvature:+.2g} %; "
-            "a flux map is measured"
-        )
-        return True
+        shown = []
+        if abs(curvature) >= SATURATED:
+            shown.append(f"d currents change the flux of their mean by {100.0 * curvature:+.2g} %")
+        if abs(change) >= BEND_NOTED:
+            shown.append(f"L_d changes by {100.0 * change:+.2g} % up to {I_nom:.3g} A")
+        if shown:
+            self.say(f"the machine saturates: {', '.join(shown)}; a flux map is measured")
+        return bool(shown)
 
     def _flux(self, resistance: ResistanceResult) -> FluxResult:
         """Return what the speed run shows, with rough inductances and the drive's own temperature coefficient."""
@@ -300,7 +314,7 @@ class Measurement:
             self._tell_spent()
 
     def _computed(self, compute: Callable[[], _Found]) -> _Found:
-        """Compute with the drive off: it takes 0.2 to 0.4 s, and an energised drive waits 0.35 s for a heartbeat."""
+        """Compute with the drive off: it takes 0.2 to 3 s, and an energised drive waits 0.35 s for a heartbeat."""
         self.drive.disable()
         found = compute()
         self.drive.enable()

@@ -169,6 +169,9 @@ def test_a_bend_is_told_with_its_size(plain: Shots, bent: Shots) -> None:
     assert found.axes["d"].bend_per_a == pytest.approx(true, rel=BEND_TOLERANCE)
     (said,) = warnings_of(Evaluation(NOISE, inductance=found), ASKED)
     assert said.startswith("L_d changes by -29 % from i_d = 0 to ") and "commission --flux-map" in said
+    refused = {"map": IdentificationError("E_EXCITATION", "no pulses")}
+    (tried,) = warnings_of(Evaluation(NOISE, inductance=found, refused=refused), ASKED)
+    assert said.startswith(tried) and "--flux-map" not in tried
     for k in range(plain.drives.n):
         assert warnings_of(Evaluation(NOISE, inductance=plain.estimate(k)), ASKED) == []
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,10 +32,12 @@ from pmsmtool.machine.flux_map_import import load_flux_map
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.profile import machine_path
+from pmsmtool.measurement import measure
 from pmsmtool.measurement.by_injection import envelope_of, nameplate_of
 from pmsmtool.measurement.flux_map import IF_SATURATED, measure_map, plan_lines
 from pmsmtool.measurement.identify import identify
 from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.measure import Measurement
 from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
@@ -155,3 +158,20 @@ def test_a_held_rotor_allows_the_map_and_nothing_that_turns() -> None:
     IdentifyRequest(("R", "map"), shaft="locked").check()
     with pytest.raises(NotAvailable, match="psi"):
         IdentifyRequest(("map", "psi"), shaft="locked").check()
+
+
+@pytest.mark.parametrize(
+    ("curvature", "change", "due"), [(0.012, 0.0, 1), (0.002, -0.4, 1), (0.002, 0.2, 1), (0.009, 0.14, 0)]
+)
+def test_a_map_is_due_by_what_the_inductance_changes(
+    curvature: float, change: float, due: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """L_d of 1.18 to 0.80 of its value passed for constant where L I is 3 % of psi_f: the flux alone was looked at."""
+    limits, said, switched = Limits(10.0, 12.0, 100.0, 24.0), [], []
+    drive = SimpleNamespace(disable=lambda: switched.append("off"), enable=lambda: switched.append("on"))
+    measurement = Measurement(drive, limits, lambda name, trace: None, said.append)  # type: ignore[arg-type]
+    found = SimpleNamespace(d_change=lambda i_a: change * i_a / limits.I_nom_apk)
+    monkeypatch.setattr(Measurement, "_flux", lambda self, resistance: SimpleNamespace(curvature=curvature))
+    monkeypatch.setattr(measure, "inductance_of", lambda traces, known, tolerance: found)
+    assert measurement._saturates(*[SimpleNamespace()] * 3) == bool(due)  # type: ignore[arg-type]
+    assert switched == ["off", "on"] and len(said) == due

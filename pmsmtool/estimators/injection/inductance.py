@@ -133,6 +133,10 @@ class InductanceResult:
     samplings: tuple[tuple[float, Sampling], ...] = ()
     apart_s: float = 0.0
 
+    def d_change(self, i_d_a: float) -> float:
+        """Return the relative change of L_d from no current to i_d, by its slope at the bias."""
+        return i_d_a * self.axes["d"].bend_per_a
+
 
 def estimate_inductances(
     d_shots: Sequence[Trace],
