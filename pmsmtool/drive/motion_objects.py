@@ -28,6 +28,8 @@ MOTOR_TURNS = DriveObject(0x608F, 2, "I")
 POSITION = DriveObject(0x6064, 0, "i")
 MAX_TORQUE_PERMILLE = DriveObject(0x6072, 0, "H")
 TORQUE_PERMILLE = DriveObject(0x6077, 0, "h")
+ASKED_PERMILLE = DriveObject(0x6074, 0, "h")
+"""Torque demand: what the current loop is asked for, in the unit of 0x6077 (CiA 402-2)."""
 POLARITY = DriveObject(0x607E, 0, "B")
 GEAR_MOTOR, GEAR_SHAFT = DriveObject(0x6091, 1, "I"), DriveObject(0x6091, 2, "I")
 FEED, FEED_TURNS = DriveObject(0x6092, 1, "I"), DriveObject(0x6092, 2, "I")
@@ -191,6 +193,19 @@ def shown_current(node: DriveNode, rated: float) -> Quantity:
         "the drive shows neither current (0x6078) nor torque (0x6077) in a unit that is known",
         where=f"node {node.node}",
     )
+
+
+def asked_current(node: DriveNode, shown: Quantity) -> tuple[DriveObject, ...]:
+    """Return where the drive shows the current that its current loop is asked for, and what that gives, in one unit.
+
+    Empty where it does not: of the map's own objects both are needed, else those of CiA 402.
+    """
+    own = _own(node, "asked_current")
+    if own is not None and own.per_count == shown.per_count and node.held(own.item) is not None:
+        return own.item, shown.item
+    if node.held(ASKED_PERMILLE) is not None and node.held(TORQUE_PERMILLE) is not None:
+        return ASKED_PERMILLE, TORQUE_PERMILLE
+    return ()
 
 
 def undecided(node: DriveNode, rated: float) -> bool:

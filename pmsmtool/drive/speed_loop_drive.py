@@ -18,7 +18,14 @@ import numpy as np
 from pmsmtool.bus.connection import RESOLUTION_S, Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
-from pmsmtool.drive.motion_objects import POSITION, TORQUE_PERMILLE, allowed, current_limits, rated_current
+from pmsmtool.drive.motion_objects import (
+    POSITION,
+    TORQUE_PERMILLE,
+    allowed,
+    asked_current,
+    current_limits,
+    rated_current,
+)
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S
@@ -27,7 +34,7 @@ from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import LimitExceeded, NotAvailable, SdoAbort
 from pmsmtool.trace import Trace
 
-SHOWN = ("position", "current")
+ASKED = ("asked", "flows")
 OSCILLATION_SAMPLES = 20
 """Periods of sampling over which an oscillation is judged."""
 LARGEST_COUNT = 2.0 * math.pi
@@ -35,11 +42,18 @@ LARGEST_COUNT = 2.0 * math.pi
 
 
 class Row(NamedTuple):
-    """One sample: when it was sent (s), position (rad) and current (A)."""
+    """One sample: when it was sent (s), position (rad), current (A).
+
+    Where the drive shows it, counts of the current that is asked for and of the one that flows, and how much later than
+    ``current_a`` (s) the former was read.
+    """
 
     t_s: float
     position_rad: float
     current_a: float
+    asked: float = 0.0
+    flows: float = 0.0
+    later_s: float = 0.0
 
 
 class Oscillation:
@@ -94,6 +108,8 @@ class SpeedLoopDrive(TorqueDrive):
         Whether the current that is shown was taken as rms without a source: a share of 0x6075 is, too.
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
+    asked : tuple of DriveObject
+        Where it shows the current that its speed loop asks for, and what flows, in one unit; empty: it does not.
     """
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
@@ -118,6 +134,7 @@ class SpeedLoopDrive(TorqueDrive):
         self.read_as_rms = self.current_undecided or (of_standard and share)
         self.oscillation = Oscillation()
         self.sends = True
+        self.asked = asked_current(self.node, self._current)
         self._sending: AbstractContextManager[LiveValues] | None = None
         self._samples: list[Row] = []
         self._due: list[tuple[float, float]] = []
@@ -154,7 +171,8 @@ class SpeedLoopDrive(TorqueDrive):
     def send_samples(self) -> None:
         """Have the drive send position and current every millisecond, where it can; else they will be asked for."""
         items = {"position": POSITION, "current": self._current.item}
-        sending = live_values(self.node, SHOWN, POLL_PERIOD_S, items)
+        items |= {name: item for name, item in zip(ASKED, self.asked, strict=False) if item != self._current.item}
+        sending = live_values(self.node, list(items), POLL_PERIOD_S, items)
         try:
             live = sending.__enter__()
         except (NotAvailable, SdoAbort):  # fixed process data
@@ -166,7 +184,9 @@ class SpeedLoopDrive(TorqueDrive):
             if self._recording:
                 # an adapter's time stamps begin where they like; the shortest way here ties them to the clock
                 self._behind_s = min(self._behind_s, self.node.connection.clock.now() - stamp_s)
-                self._take(stamp_s, live.values["position"], live.values["current"])
+                position, current = live.values["position"], live.values["current"]
+                asked, flows = (live.values.get(name, current) for name in ASKED)
+                self._take(stamp_s, position, current, asked, flows)
 
         live.on_set = note
 
@@ -200,15 +220,19 @@ class SpeedLoopDrive(TorqueDrive):
         """Return the samples, with the references written and their times in ``meta`` (rad/s, s)."""
         self._recording = False
         self.check_operating()
-        table = np.array(self._samples, dtype=np.float64).reshape(len(self._samples), 3)
+        table = np.array(self._samples, dtype=np.float64).reshape(len(self._samples), 6)
         if self.sends and len(table):
             table[:, 0] += self._behind_s
         first = table[0, 0] if len(table) else 0.0
         steps = [[t - first, speed] for t, speed in self._written]
-        return Trace(
-            table[:, 0] - first, {"theta_m_rad": table[:, 1], "i_q_a": table[:, 2]},
-            {"theta_m_rad": "rad", "i_q_a": "A"}, {"polled": not self.sends, "steps": steps},
-        )  # fmt: skip
+        signals = {"theta_m_rad": table[:, 1], "i_q_a": table[:, 2]}
+        if self.asked:  # in the unit of a current that both objects show
+            current, flows = table[:, 2], table[:, 4]
+            signals["i_q_ref_a"] = table[:, 3] * (current @ flows) / max(float(flows @ flows), 1.0)
+        units = {name: objects.signal_unit(name) for name in signals}
+        later_s = float(np.median(table[:, 5])) if len(table) else 0.0
+        meta = {"polled": not self.sends, "steps": steps, "asked_later_s": later_s}
+        return Trace(table[:, 0] - first, signals, units, meta)
 
     def end_excitation(self) -> None:
         """Leave the speed where it is: the next command takes it back."""
@@ -238,17 +262,22 @@ class SpeedLoopDrive(TorqueDrive):
         super().wait(max(0.0, end - clock.now()))
 
     def _ask(self) -> None:
-        before = self.node.connection.clock.now()
-        position = self.node.get(POSITION)
-        between = self.node.connection.clock.now()
-        current = self.node.get(self._current.item)
-        self._take(0.5 * (before + between), position, current)
+        values, at = {}, {}
+        for item in dict.fromkeys((POSITION, self._current.item, *self.asked)):
+            before = self.node.connection.clock.now()
+            values[item] = self.node.get(item)
+            at[item] = 0.5 * (before + self.node.connection.clock.now())
+        asked, flows = self.asked or (self._current.item, self._current.item)
+        row = values[POSITION], values[self._current.item], values[asked], values[flows]
+        self._take(at[POSITION], *row, at[asked] - at[self._current.item])
 
-    def _take(self, t_s: float, counts: float, current: float) -> None:
+    def _take(
+        self, t_s: float, counts: float, current: float, asked: float = 0.0, flows: float = 0.0, later_s: float = 0.0
+    ) -> None:
         if self._unwrapped is not None:
             step = counts - self._unwrapped
             counts = self._unwrapped + step - round(step / 2.0**32) * 2.0**32
         self._unwrapped = counts
         position = 2.0 * math.pi * counts / self.counts_per_turn
-        self._samples.append(Row(t_s, position, current * self._current.per_count))
+        self._samples.append(Row(t_s, position, current * self._current.per_count, asked, flows, later_s))
         self.oscillation.take(self._samples[-1].current_a)

@@ -18,6 +18,7 @@ DIMENSIONS: Mapping[str, str] = {
     "current_limit": "current",
     "rated_current": "current",
     "current": "current",
+    "asked_current": "current",
     "target_current": "current",
     "target_speed": "angular speed",
     "speed_limit": "angular speed",

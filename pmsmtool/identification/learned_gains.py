@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+from pmsmtool.identification.asked_current import AskedLoop
 from pmsmtool.identification.speed_loop_response import SpeedLoop
 
 NORMAL_95 = 1.96
@@ -103,6 +104,8 @@ class Observation:
         Largest current over the rated one.
     model_std : tuple of float
         Standard deviation of K_p, K_i and K_i / K_p (relative) by the EMF's share and by where the loop's lag lies.
+    asked : AskedLoop or None
+        What the current that the loop asked for says, where the drive shows it.
     """
 
     gain: float
@@ -110,6 +113,18 @@ class Observation:
     loop: SpeedLoop
     current_share: float = 1.0
     model_std: tuple[float, float, float] = NO_DOUBT
+    asked: AskedLoop | None = None
+
+    @property
+    def loops(self) -> tuple[SpeedLoop, ...]:
+        """What was measured, in either way; the better one last."""
+        return (self.loop,) if self.asked is None else (self.loop, self.asked.loop)
+
+    def by_asked(self) -> Observation:
+        """Return what the current that was asked for says: nothing that current loop and dead time do is in it."""
+        if self.asked is None:
+            return self
+        return replace(self, loop=self.asked.loop, model_std=self.asked.std, current_share=math.inf)
 
     @property
     def std(self) -> float:

@@ -83,6 +83,10 @@ class StepRecord:
         Where the samples count: the current keeps its sign there.
     noise_rad, noise_a : float
         Standard deviation of position and current at a held speed.
+    asked_a : ndarray, shape (n,), or None
+        Current that the speed loop asks for, where the drive shows it.
+    asked_later_s : float
+        How much later than the current that one was read.
     """
 
     t_s: Array
@@ -92,6 +96,8 @@ class StepRecord:
     segments: Sequence[tuple[float, float]]
     noise_rad: float
     noise_a: float
+    asked_a: Array | None = None
+    asked_later_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from pmsmtool.drive.motion_objects import allowed, speed_limits
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
 from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
+from pmsmtool.identification.asked_current import fit_asked_current, shows_asked
 from pmsmtool.identification.learned_gains import BANDWIDTH_DOUBT, NO_DOUBT, Observation, emf_doubt, lag_doubt
 from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop, StepRecord, fit_speed_loop, phase_margin_rad
 from pmsmtool.machine.machine_file import MachineFile
@@ -85,6 +86,8 @@ class LearnedLoop:
     integral_changed: Sequence[Observation]
     speed_unit_rad_s: float
     notes: Sequence[str]
+    by_asked: bool = False
+    """Whether everything rests on the current that the loop asks for; else on the one that flows."""
 
 
 def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: float, speed_max_rad_s: float) -> float:
@@ -153,23 +156,38 @@ def learn_speed_loop(
             return _Learner(guard, drive, put, emf, say).run(gain, integral)
 
 
-def _margin(own: SpeedLoop, worst: tuple[float, float]) -> float:
-    """Return the least phase margin (rad) where K_p and K_i may have changed by these ratios, whatever the form."""
-    a, b, lag_s = own.K_p_per_J, own.K_i_per_J, own.lag_s
-    return min(phase_margin_rad(a * p, b * i, lag_s) for p in (1.0, worst[0]) for i in (1.0, worst[0], worst[1]))
+def _margin(own: Observation, worst: tuple[float, float]) -> float:
+    """Return the least phase margin (rad) where K_p and K_i may have changed by these ratios, whatever the form.
+
+    What is asked for shows the gains without the inverter's dead time, which makes less of them at a small current.
+    """
+    return min(
+        phase_margin_rad(loop.K_p_per_J * p, loop.K_i_per_J * i, loop.lag_s)
+        for loop in own.loops for p in (1.0, worst[0]) for i in (1.0, worst[0], worst[1])
+    )  # fmt: skip
 
 
-def _smaller(own: SpeedLoop, changed: SpeedLoop, ratio: float) -> float | None:
+def _smaller(base: Observation, after: Observation, ratio: float) -> float | None:
     """Return in which ratio counts must change to make K_i smaller; None where that is not sure.
 
     K_i / K_p must show it, for the fit tells K_i and K_p apart least; K_i must not show the contrary.
     """
+    own, changed = list(zip(base.loops, after.loops, strict=False))[-1]
     sure = SURE * abs(math.log(ratio))
     K_i = math.log(changed.K_i_per_J / own.K_i_per_J)
     relative = K_i - math.log(changed.K_p_per_J / own.K_p_per_J)
     if relative < -sure and K_i < 0.5 * sure:
         return FURTHER_DOWN
     return 1.0 / FURTHER_DOWN if relative > sure and K_i > -0.5 * sure else None
+
+
+def _by_asked(measured: LearnedLoop) -> LearnedLoop:
+    """Return everything as the current that was asked for shows it."""
+    return replace(
+        measured, base=[one.by_asked() for one in measured.base],
+        gain_changed=measured.gain_changed and measured.gain_changed.by_asked(),
+        integral_changed=[one.by_asked() for one in measured.integral_changed], by_asked=True,
+    )  # fmt: skip
 
 
 def staircase(
@@ -209,6 +227,7 @@ class _Learner:
         self.low, self.span = LOW_SHARE * limit, (HIGH_SHARE - LOW_SHARE) * limit
         self.bandwidth, self.hold_s, self.settle_s = FIRST_BANDWIDTH, HOLD_TIMES / FIRST_BANDWIDTH, SETTLE_S
         self.notes: list[str] = []
+        self.asks = False
 
     def run(self, gain: GainObject, integral: GainObject) -> LearnedLoop:
         """Measure everything."""
@@ -221,8 +240,8 @@ class _Learner:
         )
         counts = {GAIN: gain.counts, INTEGRAL: integral.counts}
         own = self._observe("with the drive's own gains", self._size(), counts)
-        self.bandwidth = own.loop.K_p_per_J
-        integral_s = self.bandwidth / own.loop.K_i_per_J
+        self.bandwidth = own.loops[-1].K_p_per_J
+        integral_s = self.bandwidth / own.loops[-1].K_i_per_J
         self.settle_s = min(max(SETTLE_S, SETTLE_TIMES * integral_s), LONGEST_S)
         wanted_s = max(HOLD_TIMES / self.bandwidth, HOLD_INTEGRAL * integral_s)
         self.hold_s = min(max(wanted_s, HOLD_S[0]), HOLD_S[1])
@@ -230,15 +249,22 @@ class _Learner:
         own = self._observe(f"with steps held for {1e3 * self.hold_s:.0f} ms", step, counts, own.loop)
         drive.oscillation.limit_a = TRIP * max(drive.oscillation.largest_a, drive.current_count_a)
         half = self._observe("with steps of half the size", 0.5 * step, counts, own.loop, own.loop.lag_s)
-        gain_changed = self._changed(gain, DOWN, own.loop, (DOWN, DOWN), step, counts)
-        little = _margin(own.loop, (1.0, 1.0 / INTEGRAL_DOWN)) < LEAST_MARGIN_RAD
+        gain_changed = self._changed(gain, DOWN, own, (DOWN, DOWN), step, counts)
+        little = _margin(own, (1.0, 1.0 / INTEGRAL_DOWN)) < LEAST_MARGIN_RAD
         ratio = LITTLE_DOWN if little else INTEGRAL_DOWN
-        integral_changed = [self._changed(integral, ratio, own.loop, (1.0, 1.0 / ratio), step, counts)]
-        further = None if integral_changed[0] is None else _smaller(own.loop, integral_changed[0].loop, ratio)
+        integral_changed = [self._changed(integral, ratio, own, (1.0, 1.0 / ratio), step, counts)]
+        further = None if integral_changed[0] is None else _smaller(own, integral_changed[0], ratio)
         if further is not None:
-            integral_changed.append(self._changed(integral, further, own.loop, (1.0, FURTHER_DOWN), step, counts))
+            integral_changed.append(self._changed(integral, further, own, (1.0, FURTHER_DOWN), step, counts))
         found = [observation for observation in integral_changed if observation is not None]
-        return LearnedLoop((own, half), gain_changed, found, unit, self.notes)
+        measured = LearnedLoop((own, half), gain_changed, found, unit, self.notes)
+        if all(one is None or one.asked for one in (own, half, gain_changed, *found)):
+            return _by_asked(measured)
+        self.notes.append(
+            "the current that the speed loop asks for is not shown, or not surely: the intervals hold what current "
+            "loop and dead time may take from it"
+        )
+        return measured
 
     @property
     def risen(self) -> float:
@@ -286,7 +312,10 @@ class _Learner:
         count = 2.0 * math.pi / abs(drive.counts_per_turn)
         noise_rad = math.hypot(float(np.std(position[still] - speed * t[still] - at)), ROUNDING * count)
         noise_a = math.hypot(float(np.std(current[still])), ROUNDING * drive.current_count_a)
-        return StepRecord(t, position, current, references, ways, noise_rad, noise_a)
+        return StepRecord(
+            t, position, current, references, ways, noise_rad, noise_a, trace.signals.get("i_q_ref_a"),
+            trace.meta["asked_later_s"],
+        )  # fmt: skip
 
     def _observe(
         self,
@@ -307,20 +336,24 @@ class _Learner:
             placed = lag_doubt(loop, fit_speed_loop(record, self.emf, loop, forward=True))
             K_p, K_i, rate = map(math.hypot, emf_doubt(low, high, most), placed)
             model_std = K_p, K_i, rate
-        margin = math.degrees(phase_margin_rad(loop.K_p_per_J, loop.K_i_per_J, loop.lag_s))
+        if lag_s is None:
+            self.asks = shows_asked(record, loop, self.emf)
+        asked = fit_asked_current(record, loop) if self.asks else None
+        peak = float(np.abs(record.current_a).max())
+        found = Observation(counts[GAIN], counts[INTEGRAL], loop, peak / self.drive.rated_apk, model_std, asked)
+        margin, seen = math.degrees(_margin(found, (1.0, 1.0))), found.loops[-1]
         self.say(
-            f"{what}: K_p/J {loop.K_p_per_J:.4g} 1/s, K_i/K_p {loop.K_i_per_J / loop.K_p_per_J:.3g} 1/s, "
+            f"{what}: K_p/J {seen.K_p_per_J:.4g} 1/s, K_i/K_p {seen.K_i_per_J / seen.K_p_per_J:.3g} 1/s, "
             f"phase margin about {margin:.0f} deg"
         )
         self.guard.enable()
-        peak = float(np.abs(record.current_a).max())
-        return Observation(counts[GAIN], counts[INTEGRAL], loop, peak / self.drive.rated_apk, model_std)
+        return found
 
     def _changed(
         self,
         gain: GainObject,
         ratio: float,
-        own: SpeedLoop,
+        own: Observation,
         worst: tuple[float, float],
         step: float,
         counts: Mapping[str, float],
@@ -352,7 +385,7 @@ class _Learner:
         found = None
         try:
             what = f"{gain.address} {gain.counts:.9g} -> {new:.9g}"
-            found = self._observe(what, step, {**counts, gain.name: new}, own, own.lag_s)
+            found = self._observe(what, step, {**counts, gain.name: new}, own.loop, own.loop.lag_s)
         except IdentificationError as error:
             self.notes.append(f"{gain.name}: {error.what}")
         self.put(gain, gain.counts)  # after anything else the guard does it, and nothing is enabled again

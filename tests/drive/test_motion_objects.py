@@ -336,3 +336,19 @@ def test_a_drive_that_announces_no_mode_has_none() -> None:
         for asked in (lambda: motion.torque_target(node, 10.0), lambda: motion.limited_speed(node)):
             with pytest.raises(NotAvailable, match=r"0x6502 = 0x0\)"):
                 asked()
+
+
+@pytest.mark.parametrize(
+    ("held", "rows", "found"),
+    [
+        ({OWN: 1, motion.TORQUE_PERMILLE: 1}, {"asked_current": own(PEAK)}, (0x3001, 0x3002)),
+        ({OWN: 1}, {"asked_current": own(RMS)}, ()),  # in another unit than the current that is shown
+        ({}, {"asked_current": own(PEAK)}, ()),
+        ({motion.ASKED_PERMILLE: 1, motion.TORQUE_PERMILLE: 1}, {}, (0x6074, 0x6077)),
+        ({motion.ASKED_PERMILLE: 1}, {}, ()),
+    ],
+)
+def test_what_the_current_loop_is_asked_for(held: Held, rows: dict[str, MotionObject], found: tuple[int, ...]) -> None:
+    shown = Quantity(DriveObject(0x3002, 0, "h"), 0.01)
+    with drive(held, **rows) as node:
+        assert tuple(item.index for item in motion.asked_current(node, shown)) == found

@@ -43,6 +43,7 @@ class Bus:
 def test_a_record_without_a_sample_says_when_its_steps_were() -> None:
     drive = object.__new__(SpeedLoopDrive)
     drive.sends, drive._samples, drive._written, drive.may_be_energised = True, [], [(10.5, 20.0)], False
+    drive.asked = ()
     trace = drive.finish_record(Recording((), 0))
     assert len(trace) == 0 and trace.meta["steps"] == [[10.5, 20.0]]
 
@@ -86,7 +87,7 @@ def stairs_drive(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> SpeedLoopDrive:
     supervision = SimpleNamespace(check=lambda: None)
     drive.node = SimpleNamespace(node=1, connection=bus, get=bus.transfer, put=bus.transfer, supervision=supervision)  # type: ignore[assignment]
     drive.oscillation, drive.sends, drive.period_s, drive.rad_s_per_count = Oscillation(), False, PERIOD_S, 0.5
-    drive.counts_per_turn, drive._polled = 4000.0, ()
+    drive.counts_per_turn, drive._polled, drive.asked = 4000.0, (), ()
     drive._current = SimpleNamespace(item=object(), per_count=0.1)  # type: ignore[assignment]
     monkeypatch.setattr(SpeedLoopDrive, "check_operating", lambda self: None)
     return drive
@@ -123,6 +124,20 @@ def test_a_reference_is_written_in_the_middle_of_its_transfer(monkeypatch: pytes
     assert second == 30.0, "whole counts"
     assert trace["theta_m_rad"][0] == pytest.approx(0.5 * math.pi) and trace["i_q_a"][0] == pytest.approx(0.3)
     assert trace.t_s[0] == 0.0
+
+
+def test_what_is_asked_for_is_in_the_unit_of_the_current_and_says_when_it_was_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Torque demand and torque are permille of the rated torque; the current is what the torque is beside it."""
+    bus = Bus()
+    drive = stairs_drive(bus, monkeypatch)
+    drive.asked = DriveObject(0x6074, 0, "h"), DriveObject(0x6077, 0, "h")
+    drive.begin_record(Recording((), 0), bus.wait)
+    drive.wait(12.0 * PERIOD_S)
+    trace = drive.finish_record(Recording((), 0))
+    assert trace["i_q_ref_a"] == pytest.approx(trace["i_q_a"]) and trace["i_q_a"] == pytest.approx(0.3)
+    assert trace.meta["asked_later_s"] == pytest.approx(TRANSFER_S)
 
 
 def test_the_torque_is_taken_away_before_a_record_without_step_is_read(monkeypatch: pytest.MonkeyPatch) -> None:

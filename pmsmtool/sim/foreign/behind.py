@@ -163,6 +163,10 @@ class Behind:
         """Return the torque current (A peak)."""
         return self._signal(Signal.I_Q)
 
+    def i_q_asked_a(self) -> float:
+        """Return the torque current that the current loop is asked for (A peak)."""
+        return self._signal(Signal.I_Q_REF)
+
     def i_d_a(self) -> float:
         """Return the flux current (A peak)."""
         return self._signal(Signal.I_D)

@@ -52,7 +52,7 @@ CURRENTS: Mapping[Address, float] = {
     (0x2333, 1): 1.0, (0x2333, 2): 1.0,
 }  # fmt: skip
 """Currents that families keep by an assumed convention: what one ampere peak counts there."""
-EPOS2_CURRENTS: tuple[Address, ...] = ((0x6410, 1), (0x6410, 2), (0x6078, 0), (0x2027, 0), (0x2030, 0))
+EPOS2_CURRENTS: tuple[Address, ...] = ((0x6410, 1), (0x6410, 2), (0x6078, 0), (0x2027, 0), (0x2030, 0), (0x2031, 0))
 FAULHABER_CURRENT = (0x6078, 0)
 COUNTS = (250, 20_000)
 SMALL_COUNTS = (30, 200)

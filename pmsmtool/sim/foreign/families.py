@@ -67,6 +67,10 @@ def _current(index: int, sub: int, per_apk: float, source: str) -> Law:
     return Law(index, sub, source, show=lambda behind: per_apk * behind.i_q_a())
 
 
+def _asked_current(index: int, per_apk: float, source: str) -> Law:
+    return Law(index, 0, source, show=lambda behind: per_apk * behind.i_q_asked_a())
+
+
 def _limit(index: int, sub: int, per_apk: float, apk: float, source: str) -> Law:
     def act(behind: Behind, counts: float) -> None:
         behind.limit_current(counts / per_apk)
@@ -120,7 +124,7 @@ def _epos4(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     yield from _forward((0x30A1, 4, 1e-6), (0x30A1, 5, 1e-6), motor)
     for sub in (1, 2):
         yield _current(0x30D1, sub, 1000.0, PEAK_ASSUMED)
-    yield Law(0x30D0, 0, PEAK_ASSUMED, show=lambda behind: 1000.0 * behind.i_q_a())
+    yield _asked_current(0x30D0, 1000.0, PEAK_ASSUMED)
     yield Law(
         0x30A0, 1, "uV/A", set_up=1e6 * motor.K_p_v_per_a,
         act=lambda behind, n: behind.set_gains(K_p_v_per_a=1e-6 * n),
@@ -140,6 +144,7 @@ def _epos2(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     yield Law(0x2210, 1, "pulses, four counts each", set_up=motor.counts / 4.0)
     yield _current(0x6078, 0, 1000.0, PEAK_ASSUMED)
     yield _current(0x2027, 0, 1000.0, PEAK_ASSUMED)
+    yield _asked_current(0x2031, 1000.0, PEAK_ASSUMED)
     yield from _position_pid((0x60FB, 1, 1e-2), (0x60FB, 2, 78e-3), (0x60FB, 3, 80e-6), motor)
     yield from _forward((0x60FB, 4, 1e-6), (0x60FB, 5, 1e-6), motor)
 
@@ -162,6 +167,7 @@ def _copley(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     yield Law(0x6410, 23, source, set_up=motor.counts)
     for index in (0x221C, 0x2215):
         yield _current(index, 0, 100.0, source)
+    yield _asked_current(0x221D, 100.0, source)
     yield Law(0x2214, 0, source, show=lambda behind: 100.0 * behind.i_d_a())
     yield Law(0x2201, 0, source, show=lambda behind: 10.0 * behind.U_dc_v())
 

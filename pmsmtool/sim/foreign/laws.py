@@ -126,6 +126,10 @@ def standard_laws(objects: MakersObjects, set_up: SetUp, per_turn: float, per_rp
     yield Law(0x60EA, 0, f"{STANDARD}, 65536 a turn", set_up=0.0, act=lambda behind, n: behind.command_angle(n))
     if objects.stored(0x6087):  # 0: the file does not say; no slope is assumed
         yield Law(0x6087, 0, f"{STANDARD}, permille/s", act=lambda behind, n: behind.torque_slope(n))
+    yield Law(
+        0x6074, 0, f"{STANDARD}, permille of the rated torque",
+        show=lambda behind: 1000.0 * behind.i_q_asked_a() * set_up.torque_constant / torque,
+    )  # fmt: skip
     yield Law(0x6077, 0, STANDARD, show=lambda behind: 1000.0 * behind.torque_nm() / torque)
     yield Law(0x6078, 0, STANDARD, show=lambda behind: 1000.0 * behind.i_q_a() / set_up.i_nom_apk)
     yield Law(0x6079, 0, f"{STANDARD}, mV", show=lambda behind: 1000.0 * behind.U_dc_v())
