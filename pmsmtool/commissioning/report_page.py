@@ -158,7 +158,7 @@ def _as_judged(run: RunDirectory) -> Evaluation | None:
     return None
 
 
-_EXPERIMENTS = (("phase_vectors",), ("levels",), ("rotation",), ("square",), ("push",), ("speeds",))
+_EXPERIMENTS = (("phase_vectors",), ("levels",), ("rotation", "phase_pairs"), ("square",), ("push",), ("speeds",))
 """How the names of their traces begin, in the order the experiments are made."""
 
 
@@ -167,6 +167,8 @@ def _evaluated(traces: Mapping[str, Trace], period_s: float, *, complete: bool) 
 
     ``complete`` says that the run was not ended in the middle of its last experiment.
     """
+    if "rotation_forward" in traces:  # the pairs stand for the slow turn where there was none
+        traces = {name: trace for name, trace in traces.items() if name != "phase_pairs"}
     begun = [k for k, names in enumerate(_EXPERIMENTS) if any(trace.startswith(names) for trace in traces)]
     count = max(begun, default=0) + (1 if complete else 0)
     for last in range(count, -1, -1):

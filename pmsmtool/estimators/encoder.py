@@ -20,6 +20,8 @@ from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 STAGE = "encoder"
+RESTS = "rests on current vectors"
+"""Method of :func:`estimate_by_rests`."""
 
 INTEGER_LIMIT = 0.1
 """Largest distance of the count from an integer (docs/identification.md, 3.6)."""
@@ -42,6 +44,13 @@ directions have in common than they differ by: what a swinging rotor or friction
 without such an error none shows one; with little more than two pole pairs a rotor swings by more than most have."""
 MINIMUM_TURNS = 0.98
 """Mechanical turns the vector must have gone through in each direction."""
+REST_SHARE, HOLDING_SHARE = 0.25, 0.7
+"""Currents, of the largest, from which on a rest counts for pole pairs, and for the offset: friction and cogging hold a
+rotor the farther off its vector the smaller it is."""
+REST_LIMIT_RAD = math.radians(20.0)
+"""Largest deviation of a rest."""
+OTHER_WORSE = 3.0
+"""How much farther the rests must be from any other number of pole pairs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +164,52 @@ def estimate_encoder(forward: Trace, backward: Trace, limit_rad: float = LINEARI
         ),
         lag_rad=lag,
         per_turn=_per_turn(forward, backward, direction, count),
+    )
+
+
+def estimate_by_rests(levels: Trace, pairs: Trace) -> EncoderResult:
+    """Pole pairs, direction and offset from where the rotor rested while the vector was led on from angle to angle.
+
+    Raises IdentificationError: ``E_POLE_PAIRS``: another number of pole pairs would explain the rests, too, or none.
+
+    Parameters
+    ----------
+    levels, pairs : Trace
+        ``theta_imposed_rad`` (electrical, unwrapped), ``theta_M_rad`` (mechanical, unwrapped), ``i_d_a`` and ``moved``
+        of every rest. The first vector is reached backward, the others forward.
+    """
+    imposed, theta, current, moved = (
+        np.concatenate([levels[name], pairs[name]]) for name in ("theta_imposed_rad", "theta_M_rad", "i_d_a", "moved")
+    )
+    share = np.abs(current) / np.max(np.abs(current))
+    counts = (share >= REST_SHARE) & (moved == 0.0)
+    found = []
+    for slope in (sign * count for count in range(1, MAX_POLE_PAIRS + 1) for sign in (1, -1)):
+        off = slope * theta[counts] - imposed[counts]
+        found.append((0.5 * float(np.ptp(off)), slope))
+    (worst, slope), (other, beside) = sorted(found)[:2] if np.any(counts) else [(math.inf, 0), (math.inf, 0)]
+    if worst > REST_LIMIT_RAD or other < OTHER_WORSE * worst:
+        raise refuse(
+            "E_POLE_PAIRS",
+            f"the rests are up to {math.degrees(worst):.2g} deg (electrical) off their vectors with {abs(slope)} pole "
+            f"pairs, up to {math.degrees(other):.2g} deg with {abs(beside)}",
+            stage=STAGE,
+        )
+    off = slope * theta - imposed
+    held = counts & (share >= HOLDING_SHARE)
+    first = imposed == imposed[0]
+    ways = [off[held & way] for way in (first, ~first)]
+    if not all(map(len, ways)):
+        raise refuse("E_POLE_PAIRS", "the rotor moved at the larger levels", stage=STAGE)
+    back, forth = (float(np.mean(way)) for way in ways)
+    std = math.hypot(0.25 * abs(back - forth), float(np.std(off[counts])))
+    return EncoderResult(
+        Estimate(float(abs(slope)), worst / float(np.ptp(theta[counts])), 0.0, "1", n=int(counts.sum()), method=RESTS),
+        direction=int(math.copysign(1.0, slope)),
+        offset=Estimate(
+            float(wrapped(np.array([0.5 * (back + forth)]))[0]), std, 0.0, "rad", n=int(held.sum()), method=RESTS
+        ),
+        lag_rad=0.5 * (forth - back),
     )
 
 

@@ -69,6 +69,8 @@ class LevelPlan:
         Change of the voltage between the halves of a window, relative, that asks for another window.
     turn_s : float
         Time of a turn of the vector, of the waits alone (s).
+    onward : bool
+        Whether every change of sign turns the vector on instead of back: the rests then show the pole pairs.
     """
 
     levels_a: Sequence[float]
@@ -79,6 +81,7 @@ class LevelPlan:
     angle_rad: float = DC_ANGLE_RAD
     drift: float = DRIFTED
     turn_s: float = TURN_S
+    onward: bool = False
 
     def half_window(self, period_s: float) -> int:
         """Return the control periods of half a window."""
@@ -160,7 +163,9 @@ PAIR_ARRIVED = 0.005
 time the controller of the parameter set is slow, and 2 % below its set-point it made 12 % of a slope."""
 
 
-def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s: float = TURN_S) -> Trace:
+def hold_pairs(
+    drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s: float = TURN_S, *, rests: bool = False
+) -> Trace:
     """Hold two currents through each pair of phases, the third phase idle; return one row of means for each.
 
     Parameters
@@ -172,6 +177,8 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s
     turn_a, start_rad, turn_s : float
         Current that turns the rotor from pair to pair (A peak), the vector that was held last (rad electrical), and the
         time of a turn (s).
+    rests : bool
+        Whether the rows also have the angles of vector and encoder.
     """
     names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
     half = PERIODS // 2
@@ -179,8 +186,9 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s
     times: list[float] = []
     elapsed = 0.0
     angle = start_rad
+    whole = 2.0 * math.pi * round((start_rad - DC_ANGLE_RAD) / (2.0 * math.pi))
     for k in range(3):
-        target = DC_ANGLE_RAD + PHASE_ANGLES_RAD[k]
+        target = whole + DC_ANGLE_RAD + PHASE_ANGLES_RAD[k]
         if target != angle:
             elapsed += turn_vector(drive, turn_a, angle, target, turn_s)
             angle = target
@@ -195,7 +203,8 @@ def hold_pairs(drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s
                     break
             times[len(rows) :] = [elapsed]
             row = {name: 0.5 * (first[name] + second[name]) for name in names if name != "theta_m_rad"}
-            rows.append({**row, "moved": float(moved)})
+            shown = {"theta_imposed_rad": angle, "theta_M_rad": second["theta_m_rad"]} if rests else {}
+            rows.append({**row, "moved": float(moved), **shown})
             elapsed += PERIODS * drive.period_s
     drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
     return table(rows, times, i_command_a=i_a, idle=["a", "a", "b", "b", "c", "c"])
@@ -254,6 +263,8 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
     for level in plan.levels_a:
         sign = math.copysign(1.0, level)
         target = plan.angle_rad if sign > 0.0 else plan.angle_rad + math.pi
+        if plan.onward:
+            target += 2.0 * math.pi * max(0, math.ceil((angle - target) / (2.0 * math.pi) - 0.25))
         if angle != target:
             elapsed += turn_vector(drive, plan.turn_a, angle, target, plan.turn_s)
             angle = target
@@ -282,6 +293,8 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
                 row[axis] *= sign
         row["moved"] = float(moved)
         row["theta_M_rad"] = second["theta_m_rad"]
+        if plan.onward:
+            row["theta_imposed_rad"] = angle
         row["flagged"] = float(first["flags"] + second["flags"] > 0.0)  # a mean of flag words: any bit counts
         rows.append(row)
         if row["flagged"]:

@@ -12,7 +12,13 @@ import numpy as np
 
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.estimators.cross_check import CrossCheck, cross_check
-from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.encoder import (
+    JUMP_LIMIT_RAD,
+    EncoderResult,
+    check_encoder_counts,
+    estimate_by_rests,
+    estimate_encoder,
+)
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult, check_magnet, estimate_flux_linkage
 from pmsmtool.estimators.flux.map_result import FluxMapResult
@@ -261,6 +267,9 @@ def evaluate(
     if "rotation_backward" in traces:
         turns = traces["rotation_forward"], traces["rotation_backward"]
         result = replace(result, encoder=attempt("encoder", lambda: estimate_encoder(*turns, JUMP_LIMIT_RAD)))
+    elif "phase_pairs" in traces and "theta_imposed_rad" in traces["phase_pairs"].signals:
+        rests = traces["levels"], traces["phase_pairs"]
+        result = replace(result, encoder=attempt("encoder", lambda: estimate_by_rests(*rests)))
     resistance = result.resistance
     # a wrong angle or number of pole pairs is in the speeds, too
     if "speeds" in traces and resistance is not None and "encoder" not in refused:

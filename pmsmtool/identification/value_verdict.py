@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS
 from pmsmtool.estimators.cross_check import CrossCheck
+from pmsmtool.estimators.encoder import RESTS
 from pmsmtool.estimators.estimate import Verdict, coverage_factor, statistical_half_width, total_half_width
 from pmsmtool.estimators.injection.inductance import InductanceResult
 from pmsmtool.estimators.resistance import at_the_test
@@ -39,6 +40,10 @@ TOLD_BY: Mapping[str, tuple[str, ...]] = {
     "mechanics": ("J_per_psi", "J_per_kt"),
 }  # fmt: skip
 """Keys of the estimates of which one answers for a quantity."""
+NO_SLOW_TURN = (
+    "the encoder's error once and twice per turn was not looked for: with --accuracy pole pairs and offset come from "
+    "the rotor's rests, without the slow turn"
+)
 NOT_TOLD = "E_NOT_MEASURED"
 BEND_NOTED = 0.15
 """Relative change of L_d from no current to twice the bias (the rated current) from which on a flux map is due, and
@@ -126,9 +131,11 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
         lines += [
             f"the encoder is off by {math.degrees(error):.2g} deg (mechanical) {often} per turn: mounted off centre? "
             "J, B and tau_c of torque pulses are without it"
-            for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=True)
+            for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=False)
             if error > 0.0
         ]
+        if evaluation.encoder.offset.method == RESTS:
+            lines.append(NO_SLOW_TURN)
     if evaluation.mechanics is not None and evaluation.mechanics.harmonics.line_rad:
         once = evaluation.mechanics.harmonics.line_rad[0]
         error_rad = max(h.amplitude for h in evaluation.mechanics.harmonics.line_rad)

@@ -145,7 +145,8 @@ def plan_lines(envelope: Envelope, request: IdentifyRequest, nameplate: MachineF
     unused = unused_current(envelope.i_max_apk, nameplate, pulses="map" in steps)
     lines = [*unused, f"the rotor aligns with current vectors: it may jump by half an electrical turn; {HOMING_LOST}"]
     if "rotation" in steps:
-        lines.append("the shaft turns slowly through one turn each way")
+        unless = "" if request.accuracy is None else " unless the rotor's rests show the pole pairs"
+        lines.append(f"the shaft turns slowly through one turn each way{unless}")
     if "speeds" in steps:
         speeds = "four" if request.accuracy is None else "two to four"
         lines.append("torque pulses turn the shaft both ways")

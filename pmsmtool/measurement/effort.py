@@ -71,10 +71,15 @@ ALL_LEVELS = LevelEffort()
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """What is collected; the default is all of it. ``rotations`` are tried before the usual slow turns."""
+    """What is collected; the default is all of it. ``rotations`` are tried before the usual slow turns.
+
+    With ``rests`` pole pairs, direction and offset come from the rotor's rests on the vectors of levels and pairs,
+    where these show them, without the slow turn.
+    """
 
     levels: LevelEffort = ALL_LEVELS
     turn_s: float = vector_turn.TURN_S
+    rests: bool = False
     rotations: tuple[Rotation, ...] = ()
     shot_samples: int = square_injection.SHOT_SAMPLES
     speeds: SpeedEffort = ALL_SPEEDS
@@ -118,7 +123,7 @@ def effort_for(accuracy: float | None, predicted: Callable[[Effort], Prediction]
         (one for one in SHOT_EFFORTS if enough(predicted(Effort(shot_samples=one)).L, L_MISFIT)), SHOT_EFFORTS[-1]
     )
     speeds = SPEED_EFFORTS[0 if enough(predicted(ALL).psi_f, PSI_MISFIT) else -1]
-    return Effort(levels, QUICK_TURN_S, (QUICK_ROTATION,), shots, speeds)
+    return Effort(levels, QUICK_TURN_S, True, (QUICK_ROTATION,), shots, speeds)
 
 
 def larger_levels(effort: LevelEffort) -> tuple[LevelEffort, ...]:

@@ -16,7 +16,13 @@ from typing import Any, TypeVar
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError, PmsmtoolError
-from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.encoder import (
+    JUMP_LIMIT_RAD,
+    EncoderResult,
+    check_encoder_counts,
+    estimate_by_rests,
+    estimate_encoder,
+)
 from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.noise import Noise, estimate_noise
@@ -33,7 +39,7 @@ from pmsmtool.experiments.current_limit import (
 )
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
-from pmsmtool.experiments.vector_turn import RAMP_S
+from pmsmtool.experiments.vector_turn import RAMP_S, turn_vector
 from pmsmtool.identification.evaluate import Evaluation, flux_of, inductance_of, resistance_of, tolerance_on
 from pmsmtool.identification.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
@@ -71,6 +77,8 @@ of the saturated profile, below 0.0035 of linear drives, 0.007 to 0.02 beside 5 
 BESIDE_RAD = math.radians(15.0)
 """Angle by which the offset of the largest current may differ from that of a rotor that jumps with a smaller one; seen
 0 to 2.4 deg, and 43 deg where reluctance turns the rotor off its vector."""
+ONTO_ZERO_S = 0.2
+"""Turn of the vector from the last pair to zero, a sixth of half a turn: where the bias of the square waves stands."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 RIPPLE_SHARE = 0.25
 
@@ -166,12 +174,12 @@ class Measurement:
             self._encoder_counts(start, standstill.DC_ANGLE_RAD)
             start = standstill.DC_ANGLE_RAD
         resistance = self._attempt("R", lambda: self._levels(noise, start)) if "levels" in steps else None
+        last = standstill.DC_ANGLE_RAD
         if resistance is not None:
             self._spare_supply()
-            self._pairs(noise, resistance)
+            last = self._pairs(noise, resistance)
         self._tell_spent()
-        last = standstill.DC_ANGLE_RAD + (standstill.PHASE_ANGLES_RAD[-1] if resistance is not None else 0.0)
-        encoder = self._attempt("encoder", lambda: self._rotation(last)) if "rotation" in steps else None
+        encoder = self._attempt("encoder", lambda: self._encoder(last)) if "rotation" in steps else None
         self._tell_spent()
         turned = False
         if resistance is not None and encoder is not None:
@@ -452,6 +460,7 @@ class Measurement:
             settle_s=effort.settle_s,
             drift=effort.drift,
             turn_s=self._effort.turn_s,
+            onward=self._effort.rests,
         )
 
     def _spare_supply(self) -> None:
@@ -464,15 +473,34 @@ class Measurement:
                 f"{self.limits.I_test_apk:.3g} A at standstill"
             )
 
-    def _pairs(self, noise: Noise, resistance: ResistanceResult) -> None:
-        """Compare the phases; current sensors that differ spoil every value, so that ends the run."""
+    def _pairs(self, noise: Noise, resistance: ResistanceResult) -> float:
+        """Compare the phases; return the vector that was held last (rad electrical).
+
+        Current sensors that differ spoil every value, so that ends the run.
+        """
         largest = self.limits.I_test_apk
         strongest = max(standstill.PAIR_SHARES) * largest
         self.say(f"pairs of phases: two currents up to {strongest:.3g} A through each")
-        turn_a, turn_s = self.turn_share * largest, self._effort.turn_s
-        pairs = standstill.hold_pairs(self.drive, largest, turn_a, standstill.DC_ANGLE_RAD, turn_s)
-        self.keep("phase_pairs", pairs)
+        turn_a, turn_s, rests = self.turn_share * largest, self._effort.turn_s, self._effort.rests
+        start = float(self._kept["levels"]["theta_imposed_rad"][-1]) if rests else standstill.DC_ANGLE_RAD
+        pairs = standstill.hold_pairs(self.drive, largest, turn_a, start, turn_s, rests=rests)
+        self._keep_for_later("phase_pairs", pairs)
         check_pairs(pairs, noise, resistance.curve)
+        return start + standstill.PHASE_ANGLES_RAD[-1]
+
+    def _encoder(self, start_rad: float) -> EncoderResult:
+        """Take the rests for pole pairs, direction and offset, or turn slowly; the rotor is left near angle zero."""
+        if self._effort.rests and "phase_pairs" in self._kept:
+            try:
+                found = estimate_by_rests(self._kept["levels"], self._kept["phase_pairs"])
+            except IdentificationError as refusal:
+                self.say(f"  {refusal.what}: the shaft is turned")
+            else:
+                self.say("pole pairs, direction, offset: from the rests on the vectors")
+                end = 2.0 * math.pi * math.ceil(start_rad / (2.0 * math.pi))
+                turn_vector(self.drive, self.turn_share * self.limits.I_test_apk, start_rad, end, ONTO_ZERO_S)
+                return found
+        return self._rotation(start_rad)
 
     def _rotation(self, start_rad: float) -> EncoderResult:
         """Turn the vector from where it was last; with less current and slower again when the rotor was not on it.

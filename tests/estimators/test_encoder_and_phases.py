@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import ExitCode, IdentificationError
-from pmsmtool.estimators.encoder import JUMP_LIMIT_RAD, EncoderResult, check_encoder_counts, estimate_encoder
+from pmsmtool.estimators.encoder import (
+    JUMP_LIMIT_RAD,
+    EncoderResult,
+    check_encoder_counts,
+    estimate_by_rests,
+    estimate_encoder,
+)
 from pmsmtool.estimators.estimate import SensorTolerance, Verdict
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.noise import Noise, estimate_noise
@@ -365,3 +371,35 @@ def test_every_refusal_says_what_to_do(name: str) -> None:
     assert error.exit_code is ExitCode.NOT_TRUSTWORTHY
     assert error.likely and error.hint
     assert str(error).startswith(f"somewhere: {name}: measured 3, limit 2")
+
+
+def rests(pole_pairs: int, direction: int, offset: float, holds: float) -> tuple[Trace, Trace]:
+    """Rests on vectors led on by 600 degrees, the first reached backward; friction ``holds`` a share of the torque."""
+    quarter, third = 0.5 * math.pi, 2.0 * math.pi / 3.0
+    levels = [(quarter, 0.3, 1.0), (quarter, 1.0, 1.0), (3.0 * quarter, 1.0, -1.0), (3.0 * quarter, 0.3, -1.0)]
+    levels += [(5.0 * quarter, 0.8, -1.0)]
+    pairs = [(5.0 * quarter + k * third, 0.3, -1.0) for k in range(3)]
+    found = []
+    for rows in (levels, pairs):
+        imposed, current, ahead = np.array(rows).T
+        theta = direction * (imposed + ahead * np.arcsin(holds / current) + offset) / pole_pairs
+        found.append(trace(theta_imposed_rad=imposed, theta_M_rad=theta, i_d_a=current, moved=0.0 * current))
+    return found[0], found[1]
+
+
+@pytest.mark.parametrize("pole_pairs", [1, 2, 5, 10])
+@pytest.mark.parametrize("direction", [1, -1])
+def test_rests_on_vectors_show_pole_pairs_direction_and_offset(pole_pairs: int, direction: int) -> None:
+    found = estimate_by_rests(*rests(pole_pairs, direction, 1.7, 0.02))
+    assert (found.pole_pairs.value, found.direction, found.per_turn) == (pole_pairs, direction, ())
+    assert found.offset.value == pytest.approx(1.7, abs=2e-3)  # 0.001 measured: friction cancels but for the 0.8
+    assert abs(found.lag_rad) == pytest.approx(0.02, abs=4e-3)
+
+
+def test_rests_that_another_number_of_pole_pairs_explains_tell_none() -> None:
+    """Friction of a tenth of the torque: 16 pole pairs off by 5 degrees each way, 15 or 17 by no more than 3 times."""
+    with pytest.raises(IdentificationError, match="with 1[57]"):
+        estimate_by_rests(*rests(16, 1, 0.3, 0.1))
+    levels, pairs = rests(4, 1, 0.3, 0.02)
+    with pytest.raises(IdentificationError, match="E_POLE_PAIRS"):
+        estimate_by_rests(replace(levels, signals={**levels.signals, "moved": np.ones(5)}), pairs)

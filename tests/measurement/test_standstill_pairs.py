@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,8 +14,11 @@ from pmsmtool.drive.port import Halves
 from pmsmtool.experiments.standstill import (
     ARRIVAL_LIMIT_S,
     ARRIVED,
+    DC_ANGLE_RAD,
     PAIR_ARRIVED,
     PAIR_SHARES,
+    LevelPlan,
+    hold_levels,
     hold_pairs,
     hold_phase_vectors,
 )
@@ -103,3 +107,14 @@ def test_a_current_that_does_not_come_at_a_shaft_that_stands_is_not_waited_for()
     vectors = hold_phase_vectors(drive, I_A)  # type: ignore[arg-type]
     assert vectors["i_d_a"] == pytest.approx([0.1 * I_A] * 3)
     assert drive.waited < 3 * 2.5 * ARRIVAL_LIMIT_S
+
+
+def test_a_vector_that_is_led_on_reaches_every_angle_forward() -> None:
+    """So the rests span 600 degrees (electrical) with as many turns of the vector as there and back."""
+    plan = LevelPlan((1.0, 4.0, -4.0, -1.0, 2.0), 1.5, DC_ANGLE_RAD, onward=True)
+    levels = hold_levels(LateDrive(0.0, 0), plan)  # type: ignore[arg-type]
+    quarters = levels["theta_imposed_rad"] / DC_ANGLE_RAD
+    assert quarters == pytest.approx([1.0, 1.0, 3.0, 3.0, 5.0])
+    assert "theta_imposed_rad" not in hold_levels(LateDrive(0.0, 0), replace(plan, onward=False)).signals  # type: ignore[arg-type]
+    pairs = hold_pairs(LateDrive(0.0, 0), I_A, 1.5, 5.0 * DC_ANGLE_RAD, rests=True)  # type: ignore[arg-type]
+    assert np.degrees(pairs["theta_imposed_rad"]) == pytest.approx([450.0, 450.0, 570.0, 570.0, 690.0, 690.0])
