@@ -66,6 +66,8 @@ class MechanicsPlan:
         Largest current of one: :attr:`i_q_a` is smaller where the shaft is so light that it reaches the speed at once.
     rows : int
         Largest number of rows of a push.
+    coast_units : float
+        Time of a coasting, in pushes.
     """
 
     i_q_a: float
@@ -73,11 +75,12 @@ class MechanicsPlan:
     omega_rad_s: float
     i_most_a: float
     rows: int = ROWS
+    coast_units: float = COAST_UNITS
 
     @property
     def coast_s(self) -> float:
         """Length of one coasting (s)."""
-        return min(COAST_MOST_S, max(COAST_LEAST_S, COAST_UNITS * self.unit_s))
+        return min(COAST_MOST_S, max(COAST_LEAST_S, self.coast_units * self.unit_s))
 
     @property
     def duration_s(self) -> float:

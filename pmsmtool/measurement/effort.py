@@ -9,11 +9,12 @@ them with the largest, which show the sampling instant.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
 from pmsmtool.experiments import mechanics_run, rotation, speed_run, square_injection, standstill, vector_turn
+from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.identification.prediction import Prediction
 
 Rotation = tuple[float, float, float, float]
@@ -100,6 +101,9 @@ QUICK_TURN_S = 0.4
 QUICK_ROTATION: Rotation = (0.35, math.radians(30.0), rotation.QUICK_DWELL_S, 0.35)
 """Current, step, dwell and ramp of a slow turn that is tried first (``measure.ROTATIONS``): what swings with it takes
 those. It serves pole pairs and direction; the offset comes from the speed run."""
+MECHANICS = ("J_kgm2", "B_nms", "tau_c_nm")
+COASTINGS = (1.0, 2.0, 3.0)
+"""Times of coasting, in pushes, that may be enough (``mechanics_run.COAST_UNITS``)."""
 R_MISFIT, L_MISFIT, PSI_MISFIT = 1.0, 1.5, 1.0
 """Half width that is found at the least effort, of the predicted one: it has the model's misfit, too. Largest
 of 14 random drives, two of them hard: 1.0, 1.45 and 0.93 (``benchmarks/machine_time.py``)."""
@@ -124,6 +128,21 @@ def effort_for(accuracy: float | None, predicted: Callable[[Effort], Prediction]
     )
     speeds = SPEED_EFFORTS[0 if enough(predicted(ALL).psi_f, PSI_MISFIT) else -1]
     return Effort(levels, QUICK_TURN_S, True, (QUICK_ROTATION,), shots, speeds)
+
+
+def coasting_for(
+    accuracy: float | None, plan: MechanicsPlan, predicted: Callable[[MechanicsPlan], Mapping[str, float]]
+) -> tuple[MechanicsPlan, Mapping[str, float]]:
+    """Return the plan with the shortest coasting whose J, B and tau_c are predicted within an accuracy, and these.
+
+    Unchanged without one, or where a friction is not predicted: it is too small for a short coasting.
+    """
+    for units in COASTINGS if accuracy is not None else ():
+        shorter = replace(plan, coast_units=units)
+        found = predicted(shorter)
+        if len(found) == len(MECHANICS) and COVERAGE_FACTOR * max(found.values()) <= (accuracy or 0.0):
+            return shorter, found
+    return plan, predicted(plan)
 
 
 def larger_levels(effort: LevelEffort) -> tuple[LevelEffort, ...]:

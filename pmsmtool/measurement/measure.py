@@ -49,7 +49,7 @@ from pmsmtool.identification.value_verdict import BEND_NOTED
 from pmsmtool.identification.wiring import supply_power
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import flux_map, frequency_response, mechanics, shaft_forecast
-from pmsmtool.measurement.effort import ALL, Effort, LevelEffort, effort_for, larger_levels
+from pmsmtool.measurement.effort import ALL, Effort, LevelEffort, coasting_for, effort_for, larger_levels
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.shaft_forecast import ShaftForecast, forecast_of
 from pmsmtool.measurement.speeds import EMF_SHARE, SpeedStage
@@ -285,17 +285,24 @@ class Measurement:
         """Run what measures the shaft, and say before each how well."""
         forecast = self._computed(lambda: self._forecast(noise, resistance, encoder))
         if "coasting" in steps:
+            values: dict[str, float] = {}
 
-            def pushes(plan: MechanicsPlan) -> None:
+            def chosen(plan: MechanicsPlan) -> MechanicsPlan:
+                if forecast is None:
+                    return plan
+                plan, found = self._computed(lambda: coasting_for(self.accuracy, plan, forecast.mechanics))
+                values.update(found)
+                return plan
+
+            def planned() -> None:
                 if forecast is not None:
-                    values = self._computed(lambda: forecast.mechanics(plan))
                     self.say(shaft_forecast.mechanics_line(values))
                     self._tell(entry("mechanics", values, rough=forecast.rough))
 
             self._attempt(
                 "mechanics",
                 lambda: mechanics.measure_mechanics(
-                    self.drive, self.limits, self.keep, self.say, pushes, self._effort.speeds.mechanics_rows
+                    self.drive, self.limits, self.keep, self.say, chosen, planned, self._effort.speeds.mechanics_rows
                 ),
             )
             self._tell_spent()

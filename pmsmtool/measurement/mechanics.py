@@ -54,12 +54,14 @@ def measure_mechanics(
     limits: Limits,
     keep: Callable[[str, Trace], None],
     say: Callable[[str], None],
-    planned: Callable[[MechanicsPlan], None] | None = None,
+    chosen: Callable[[MechanicsPlan], MechanicsPlan] = lambda plan: plan,
+    planned: Callable[[], None] = lambda: None,
     rows: int = mechanics_run.ROWS,
 ) -> None:
     """Run the steps; the drive holds current gains, flux linkage and rough inertia of the runs before.
 
-    ``planned`` is told the plan before anything of it moves the shaft; ``rows`` is the largest number per push.
+    ``chosen`` returns what is run of a plan, and ``planned`` is called before anything of it moves the shaft; ``rows``
+    is the largest number per push.
     """
     pole_pairs = drive.read("motor.pole_pairs")
     psi, J, L_q = (drive.read(f"motor.{name}") for name in ("psi_f_wb", "J_kgm2", "L_q_h"))
@@ -68,13 +70,12 @@ def measure_mechanics(
     per_ampere = torque_per_ampere(pole_pairs, psi)
     current, speed = limits.within_supply(current, SPEED_SHARE * largest, per_ampere)
     plan = mechanics_run.plan_mechanics(current, speed, J, per_ampere)
-    plan = replace(plan, rows=rows)
+    plan = chosen(replace(plan, rows=rows))
     say(
         f"J, B, tau_c: torque pulses of {plan.i_q_a:.3g} A up to about {rpm_from_rad_s(plan.omega_rad_s):.0f} rpm and "
         f"coasting with the voltage off, {plan.duration_s:.2g} s"
     )
-    if planned is not None:
-        planned(plan)
+    planned()
     _come_to_rest(drive, pole_pairs * plan.omega_rad_s)
     keep_part = numbered(drive, TRACE, keep)
     abort = ABORT_SHARE * pole_pairs * limits.omega_max_rad_s
