@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.experiments.signals import readable, table
-from pmsmtool.experiments.vector_turn import TURN_S, turn_vector
+from pmsmtool.experiments.vector_turn import TURN_S, come_to_rest, turn_vector
 from pmsmtool.trace import Trace
 
 NOISE_SAMPLES = 1024
@@ -69,8 +69,9 @@ class LevelPlan:
         Change of the voltage between the halves of a window, relative, that asks for another window.
     turn_s : float
         Time of a turn of the vector, of the waits alone (s).
-    onward : bool
-        Whether every change of sign turns the vector on instead of back: the rests then show the pole pairs.
+    quick : bool
+        Whether every change of sign turns the vector on instead of back, so that the rests show the pole pairs; a rotor
+        that stands where it stood before the current changed is at rest then without a second look, and a swing braked.
     """
 
     levels_a: Sequence[float]
@@ -81,7 +82,7 @@ class LevelPlan:
     angle_rad: float = DC_ANGLE_RAD
     drift: float = DRIFTED
     turn_s: float = TURN_S
-    onward: bool = False
+    quick: bool = False
 
     def half_window(self, period_s: float) -> int:
         """Return the control periods of half a window."""
@@ -114,9 +115,9 @@ def _there_and_back(up: Sequence[float]) -> tuple[float, ...]:
     return (*up[::2], *reversed(up[1::2]))
 
 
-def record_zero_current(drive: Drive) -> Trace:
+def record_zero_current(drive: Drive, samples: int = NOISE_SAMPLES) -> Trace:
     """Record both axis currents and the link of a drive that is off, in a fixed frame."""
-    return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "U_dc_v", "flags"), NOISE_SAMPLES))
+    return readable(drive.record(("i_d_a", "i_q_a", "theta_m_rad", "U_dc_v", "flags"), samples))
 
 
 PERIODS = 512
@@ -164,7 +165,7 @@ time the controller of the parameter set is slow, and 2 % below its set-point it
 
 
 def hold_pairs(
-    drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s: float = TURN_S, *, rests: bool = False
+    drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s: float = TURN_S, *, quick: bool = False
 ) -> Trace:
     """Hold two currents through each pair of phases, the third phase idle; return one row of means for each.
 
@@ -177,8 +178,8 @@ def hold_pairs(
     turn_a, start_rad, turn_s : float
         Current that turns the rotor from pair to pair (A peak), the vector that was held last (rad electrical), and the
         time of a turn (s).
-    rests : bool
-        Whether the rows also have the angles of vector and encoder.
+    quick : bool
+        Whether the rows also have the angles of vector and encoder, and a swing is braked.
     """
     names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
     half = PERIODS // 2
@@ -201,9 +202,12 @@ def hold_pairs(
                 missed = max(abs(part["i_d_a"] - share * i_a) for part in (first, second))
                 if not moved and missed <= PAIR_ARRIVED * share * i_a:
                     break
+                if quick and moved:
+                    elapsed += brake(drive, PAIR_SHARES[-1] * i_a, share * i_a, angle)
+                    turn_s = SWINGING_TURN_S
             times[len(rows) :] = [elapsed]
             row = {name: 0.5 * (first[name] + second[name]) for name in names if name != "theta_m_rad"}
-            shown = {"theta_imposed_rad": angle, "theta_M_rad": second["theta_m_rad"]} if rests else {}
+            shown = {"theta_imposed_rad": angle, "theta_M_rad": second["theta_m_rad"]} if quick else {}
             rows.append({**row, "moved": float(moved), **shown})
             elapsed += PERIODS * drive.period_s
     drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
@@ -226,15 +230,18 @@ def turn_and_look(drive: Drive, i_a: float, start_rad: float, end_rad: float, tu
     return table(rows, [0.0, seconds], i_command_a=i_a)
 
 
-def settle(drive: Drive, i_d_a: float, *, arrival_s: float = REST_LIMIT_S, near_a: float = 0.0) -> float:
+def settle(
+    drive: Drive, i_d_a: float, *, arrival_s: float = REST_LIMIT_S, near_a: float = 0.0, stood_rad: float = math.inf
+) -> float:
     """Wait until the current has arrived and the shaft stands still, or a limit is over; return the time (s).
 
+    ``stood_rad`` is where the shaft stood before the current changed: there it is at rest at the first look.
     A current that has not arrived is waited for as long as the shaft moves, and ``arrival_s`` at least. A flag ends it:
     what is limited or at full scale does not settle, it winds up.
     """
     periods = max(1, round(0.25 * LOOK_S / drive.period_s))
     waited = 0.0
-    last = math.inf
+    last = stood_rad
     while waited < REST_LIMIT_S:
         drive.wait(LOOK_S)
         waited += LOOK_S
@@ -244,6 +251,21 @@ def settle(drive: Drive, i_d_a: float, *, arrival_s: float = REST_LIMIT_S, near_
         if (at_rest and (arrived or waited >= arrival_s)) or (now["flags"] > 0.0 and not arrived):
             break
         last = now["theta_m_rad"]
+    return waited
+
+
+SWINGING_TURN_S = 3.0
+"""Time of a turn once a swing was braked: in 0.4 s a load of 36 times the inertia was left behind, and slipped."""
+
+
+def brake(drive: Drive, i_a: float, then_a: float, angle_rad: float) -> float:
+    """Bring a rotor that swings to rest on a larger current, on which it swings faster; return the time (s).
+
+    35 times the rotor's inertia swung through six windows of every level: 460 s without one value.
+    """
+    drive.command_current(i_a, 0.0, fixed_angle_rad=angle_rad)
+    waited = come_to_rest(drive, i_a, angle_rad)
+    drive.command_current(then_a, 0.0, fixed_angle_rad=angle_rad)
     return waited
 
 
@@ -259,21 +281,21 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
     rows: list[dict[str, float]] = []
     times: list[float] = []
     elapsed = 0.0
-    angle = plan.start_rad
+    angle, stood, turn_s = plan.start_rad, math.inf, plan.turn_s
     for level in plan.levels_a:
         sign = math.copysign(1.0, level)
         target = plan.angle_rad if sign > 0.0 else plan.angle_rad + math.pi
-        if plan.onward:
+        if plan.quick:
             target += 2.0 * math.pi * max(0, math.ceil((angle - target) / (2.0 * math.pi) - 0.25))
         if angle != target:
-            elapsed += turn_vector(drive, plan.turn_a, angle, target, plan.turn_s)
-            angle = target
+            elapsed += turn_vector(drive, plan.turn_a, angle, target, turn_s)
+            angle, stood = target, math.inf
         # minus is the vector turned by half a turn, not a negative current: the controller does not notice
         drive.command_current(abs(level), 0.0, fixed_angle_rad=angle)
         drive.wait(plan.settle_s)
         elapsed += plan.settle_s
         for _ in range(TRIES):
-            elapsed += settle(drive, abs(level), near_a=NEAR_SHARE * largest)
+            elapsed += settle(drive, abs(level), near_a=NEAR_SHARE * largest, stood_rad=stood)
             first, second, samples = drive.halves(names, half)
             times[len(rows) :] = [elapsed]
             elapsed += 2 * half * drive.period_s
@@ -283,8 +305,13 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
             crept = abs(second["i_d_a"] - first["i_d_a"])
             still = drifted <= plan.drift * abs(first["u_d_v"]) and crept <= CREPT * (plan.drift / DRIFTED) * largest
             moved = turned >= REST_RAD or not still
+            if plan.quick:
+                stood = second["theta_m_rad"]
             if not moved:
                 break
+            if plan.quick and turned >= REST_RAD:
+                elapsed += brake(drive, largest, abs(level), angle)
+                turn_s = SWINGING_TURN_S
         row = {name: 0.5 * (first[name] + second[name]) for name in MEANS}
         for name, unit in (("u_d", "v"), ("i_d", "a")):
             row[f"{name}_first_{unit}"] = sign * first[f"{name}_{unit}"]
@@ -293,7 +320,7 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
                 row[axis] *= sign
         row["moved"] = float(moved)
         row["theta_M_rad"] = second["theta_m_rad"]
-        if plan.onward:
+        if plan.quick:
             row["theta_imposed_rad"] = angle
         row["flagged"] = float(first["flags"] + second["flags"] > 0.0)  # a mean of flag words: any bit counts
         rows.append(row)

@@ -198,7 +198,7 @@ def measure(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Sequence[st
         V_max_v=nameplate.inverter.V_max_v,
         i_d_max_apk=envelope.i_d_max_apk,
     )
-    with guarded(task.drive, envelope, first=starting_gains(limits), say=say) as guard:
+    with guarded(task.drive, envelope, first=starting_gains(limits, request.accuracy), say=say) as guard:
         measurement = Measurement(
             guard,
             limits,

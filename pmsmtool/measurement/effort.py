@@ -64,6 +64,7 @@ class SpeedEffort:
     window_s: float = speed_run.WINDOW_S
     push_samples: int = 1024
     mechanics_rows: int = mechanics_run.ROWS
+    quick_ramps: bool = False
 
 
 ALL_SPEEDS = SpeedEffort()
@@ -74,13 +75,13 @@ ALL_LEVELS = LevelEffort()
 class Effort:
     """What is collected; the default is all of it. ``rotations`` are tried before the usual slow turns.
 
-    With ``rests`` pole pairs, direction and offset come from the rotor's rests on the vectors of levels and pairs,
-    where these show them, without the slow turn.
+    With ``quick`` pole pairs, direction and offset come from the rotor's rests on the vectors of levels and pairs,
+    where these show them, without the slow turn; levels, pairs and square waves are held as ``quick`` ones.
     """
 
     levels: LevelEffort = ALL_LEVELS
     turn_s: float = vector_turn.TURN_S
-    rests: bool = False
+    quick: bool = False
     rotations: tuple[Rotation, ...] = ()
     shot_samples: int = square_injection.SHOT_SAMPLES
     speeds: SpeedEffort = ALL_SPEEDS
@@ -92,11 +93,13 @@ LEVEL_EFFORTS = (
     LevelEffort((0.08, 0.12, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0), (0.02, 0.04), 800, 2.0 * standstill.DRIFTED),
     ALL_LEVELS,
 )
-SHOT_EFFORTS = (512, 1024, square_injection.SHOT_SAMPLES)
+SHOT_EFFORTS = (256, 512, 1024, square_injection.SHOT_SAMPLES)
 SPEED_EFFORTS = (
-    SpeedEffort((0.42, 0.85), ((1.0, 1.0), (1.0 / 3.0, 2.0 / 3.0, 1.0)), (0,), 0.04, 256, 800),
+    SpeedEffort((0.42, 0.85), ((1.0, 1.0), (1.0 / 3.0, 2.0 / 3.0, 1.0)), (0,), 0.04, 256, 800, True),
     ALL_SPEEDS,
 )
+QUICK_NOISE_SAMPLES = 400
+"""The noise is known to 2.5 % of itself."""
 QUICK_TURN_S = 0.4
 QUICK_ROTATION: Rotation = (0.35, math.radians(30.0), rotation.QUICK_DWELL_S, 0.35)
 """Current, step, dwell and ramp of a slow turn that is tried first (``measure.ROTATIONS``): what swings with it takes

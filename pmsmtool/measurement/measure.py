@@ -39,7 +39,7 @@ from pmsmtool.experiments.current_limit import (
 )
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
-from pmsmtool.experiments.vector_turn import RAMP_S, turn_vector
+from pmsmtool.experiments.vector_turn import RAMP_S, come_to_rest, turn_vector
 from pmsmtool.identification.evaluate import Evaluation, flux_of, inductance_of, resistance_of, tolerance_on
 from pmsmtool.identification.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
@@ -49,11 +49,19 @@ from pmsmtool.identification.value_verdict import BEND_NOTED
 from pmsmtool.identification.wiring import supply_power
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import flux_map, frequency_response, mechanics, shaft_forecast
-from pmsmtool.measurement.effort import ALL, Effort, LevelEffort, coasting_for, effort_for, larger_levels
+from pmsmtool.measurement.effort import (
+    ALL,
+    QUICK_NOISE_SAMPLES,
+    Effort,
+    LevelEffort,
+    coasting_for,
+    effort_for,
+    larger_levels,
+)
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.shaft_forecast import ShaftForecast, forecast_of
 from pmsmtool.measurement.speeds import EMF_SHARE, SpeedStage
-from pmsmtool.measurement.square_waves import SquareStage
+from pmsmtool.measurement.square_waves import BIAS_SHARE, SquareStage
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.trace import Trace
 
@@ -78,7 +86,7 @@ BESIDE_RAD = math.radians(15.0)
 """Angle by which the offset of the largest current may differ from that of a rotor that jumps with a smaller one; seen
 0 to 2.4 deg, and 43 deg where reluctance turns the rotor off its vector."""
 ONTO_ZERO_S = 0.2
-"""Turn of the vector from the last pair to zero, a sixth of half a turn: where the bias of the square waves stands."""
+"""Turn of the vector from the last pair to zero, with the bias of the square waves, which stands there: 30 degrees."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 RIPPLE_SHARE = 0.25
 
@@ -88,15 +96,16 @@ COMPENSATION = "inverter.deadtime_compensation"
 START_GAIN_SHARE = 1.0 / 15.0
 """Proportional gain before anything is known, of V_max / I_nom: an eighth of the limit of stability (L times 1.05 per
 period, for a delay of 1.5) where the rated current drops a tenth of the voltage in L and 30 periods are a turn."""
-START_INTEGRAL_RATE_RAD_S = 100.0
-"""Integral gain over the proportional one."""
+START_INTEGRAL_RATES_RAD_S = (100.0, 200.0)
+"""Integral gain over the proportional one, without an accuracy that is enough and with one."""
 
 
-def starting_gains(limits: Limits) -> dict[str, float]:
+def starting_gains(limits: Limits, accuracy: float | None = None) -> dict[str, float]:
     """Return gains from the ratings alone; a drive may hold those of another motor, far too weak or unstable here."""
     K_p = START_GAIN_SHARE * limits.V_max_v / limits.I_nom_apk
     gains = {"K_p_d_v_per_a": K_p, "K_p_q_v_per_a": K_p}
-    gains |= {f"K_i_{axis}_v_per_as": START_INTEGRAL_RATE_RAD_S * K_p for axis in "dq"}
+    rate = START_INTEGRAL_RATES_RAD_S[accuracy is not None]
+    gains |= {f"K_i_{axis}_v_per_as": rate * K_p for axis in "dq"}
     wanted = {f"current.{name}": gain for name, gain in gains.items()}
     # the loop that holds a bias takes its gain from the inductances
     wanted |= {f"motor.L_{axis}_h": K_p / square_injection.BIAS_BANDWIDTH_RAD_S for axis in "dq"}
@@ -198,9 +207,16 @@ class Measurement:
 
     def _driven(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> bool:
         """Run what needs the rotor's angle; whether the machine runs under control by what was found."""
-        shots = self._effort.shot_samples
+        effort = self._effort
         square = SquareStage(
-            self.drive, self.limits, self._keep_for_later, self.say, self.ripple_share, shots, self.held
+            self.drive,
+            self.limits,
+            self._keep_for_later,
+            self.say,
+            self.ripple_share,
+            effort.shot_samples,
+            self.held,
+            effort.quick,
         )
         inductances = (
             self._attempt("L", lambda: square.measure(noise, resistance, encoder)) if "square" in steps else None
@@ -357,7 +373,8 @@ class Measurement:
 
     def _zero_current(self) -> Noise:
         self.say("noise: currents of the drive at rest")
-        trace = standstill.record_zero_current(self.drive)
+        samples = standstill.NOISE_SAMPLES if self.accuracy is None else QUICK_NOISE_SAMPLES
+        trace = standstill.record_zero_current(self.drive, samples)
         self._keep_for_later("zero_current", trace)
         return estimate_noise(trace)
 
@@ -467,7 +484,7 @@ class Measurement:
             settle_s=effort.settle_s,
             drift=effort.drift,
             turn_s=self._effort.turn_s,
-            onward=self._effort.rests,
+            quick=self._effort.quick,
         )
 
     def _spare_supply(self) -> None:
@@ -488,16 +505,16 @@ class Measurement:
         largest = self.limits.I_test_apk
         strongest = max(standstill.PAIR_SHARES) * largest
         self.say(f"pairs of phases: two currents up to {strongest:.3g} A through each")
-        turn_a, turn_s, rests = self.turn_share * largest, self._effort.turn_s, self._effort.rests
-        start = float(self._kept["levels"]["theta_imposed_rad"][-1]) if rests else standstill.DC_ANGLE_RAD
-        pairs = standstill.hold_pairs(self.drive, largest, turn_a, start, turn_s, rests=rests)
+        turn_a, turn_s, quick = self.turn_share * largest, self._effort.turn_s, self._effort.quick
+        start = float(self._kept["levels"]["theta_imposed_rad"][-1]) if quick else standstill.DC_ANGLE_RAD
+        pairs = standstill.hold_pairs(self.drive, largest, turn_a, start, turn_s, quick=quick)
         self._keep_for_later("phase_pairs", pairs)
         check_pairs(pairs, noise, resistance.curve)
         return start + standstill.PHASE_ANGLES_RAD[-1]
 
     def _encoder(self, start_rad: float) -> EncoderResult:
         """Take the rests for pole pairs, direction and offset, or turn slowly; the rotor is left near angle zero."""
-        if self._effort.rests and "phase_pairs" in self._kept:
+        if self._effort.quick and "phase_pairs" in self._kept:
             try:
                 found = estimate_by_rests(self._kept["levels"], self._kept["phase_pairs"])
             except IdentificationError as refusal:
@@ -505,7 +522,9 @@ class Measurement:
             else:
                 self.say("pole pairs, direction, offset: from the rests on the vectors")
                 end = 2.0 * math.pi * math.ceil(start_rad / (2.0 * math.pi))
-                turn_vector(self.drive, self.turn_share * self.limits.I_test_apk, start_rad, end, ONTO_ZERO_S)
+                bias_a = BIAS_SHARE * self.limits.I_test_apk
+                turn_vector(self.drive, bias_a, start_rad, end, ONTO_ZERO_S)
+                come_to_rest(self.drive, bias_a, end)
                 return found
         return self._rotation(start_rad)
 

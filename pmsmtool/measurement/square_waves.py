@@ -100,7 +100,11 @@ def whole_periods(half_period: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class SquareStage:
-    """The shots on one drive, of so many samples; the other fields are those of ``measure.Measurement``."""
+    """The shots on one drive, of so many samples; the other fields are those of ``measure.Measurement``.
+
+    With ``quick`` the leads at the first angle are those at the others, and a rotor near its vector at a further angle
+    is taken as it stands.
+    """
 
     drive: Drive
     limits: Limits
@@ -109,6 +113,7 @@ class SquareStage:
     ripple_share: float
     samples: int = square_injection.SHOT_SAMPLES
     held: bool = False
+    quick: bool = False
 
     def measure(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult) -> tuple[float, float]:
         """Record the shots; return rough inductances (H) from ripple and voltage, enough for a current controller."""
@@ -126,6 +131,7 @@ class SquareStage:
         knee = resistance.curve.knee_a(max(0.0, resistance.V_dead_v))
         bias, ripple = bias_and_ripple(limits.I_test_apk, self.ripple_share, knee)
         plan = square_injection.SquarePlan(bias, ripple, U_SHARE * limits.V_max_v, samples=self.samples)
+        plan = replace(plan, lead_s=FURTHER_LEAD_S if self.quick else plan.lead_s)
         plan = self._hold_stable_bias(plan, encoder, knee, noise)
         rough: list[float] = []
         amplitudes: dict[square_injection.Axis, float] = {}
@@ -135,14 +141,15 @@ class SquareStage:
             amplitude = square_injection.find_amplitude(self.drive, plan, axis, first_v)
             first_v = square_injection.NEXT_SHARE * amplitude
             for half_period in plan.half_periods:
-                shot = self._still(encoder, plan, axis, half_period, amplitude)
+                samples = max(plan.samples, whole_periods(half_period))  # few samples are enough, few periods are not
+                shot = self._still(encoder, plan, axis, half_period, amplitude, samples)
                 self.keep(f"square_{axis}_{half_period}", shot)
             found = square_injection.ripple_of(shot, axis)
             last = plan.half_periods[-1]
             rough.append(amplitude * last * self.drive.period_s / found)
             slow = square_injection.slow_half_period(plan, self.drive.period_s, rough[-1] / resistance.R_measured.value)
             if slow:
-                samples = max(plan.samples, whole_periods(slow))  # few samples are enough, few periods are not
+                samples = max(plan.samples, whole_periods(slow))
                 shot = self._still(encoder, plan, axis, slow, amplitude * last / slow, samples)
                 self.keep(f"square_{axis}_{slow}", shot)
             amplitudes[axis] = amplitude
@@ -222,6 +229,8 @@ class SquareStage:
             if abs(rotor - target_rad) <= near_rad:
                 break
             wanted = vector + max(-FURTHER_MOST_RAD, min(FURTHER_MOST_RAD, target_rad - rotor))
+        if self.quick and abs(rotor - vector) <= BIAS_ON_RAD:
+            return replace(plan, angle_rad=vector)
         self._turn(plan, vector, rotor)  # slowly: a frame that jumps there pulls the rotor along
         return replace(plan, angle_rad=self._rotor(encoder, rotor))
 

@@ -12,7 +12,7 @@ from pmsmtool.experiments.speed_run import SETTLE_MOST_S, SETTLE_S, SteadyLoop, 
 from pmsmtool.identification.sampling import timing_estimates, timing_warnings
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.limits import Limits
-from pmsmtool.measurement.speeds import RAMP_S, ramp_of, run_d_current
+from pmsmtool.measurement.speeds import QUICK_RAMP_SHARE, RAMP_S, TORQUE_OVER, ramp_of, run_d_current
 
 R, L, I_LEAST, PERIOD_S, LEAST_RAD_S = 0.4, (1e-3, 1.5e-3), 2.0, 5e-5, 754.0
 STEPS_PER_PERIOD = 4
@@ -116,3 +116,6 @@ def test_a_heavy_shaft_turns_no_faster_than_its_ramps_bring_it(J_kgm2: float, sh
     i_run, omega = ramp_of(limits, 280.0, 100.0, 0.075, J_kgm2)
     assert i_run == share * limits.I_test_apk and omega <= RAMP_S * 0.075 * i_run / J_kgm2
     assert (omega == 280.0) is (J_kgm2 < 0.1)
+    quick, _ = ramp_of(limits, 280.0, 100.0, 0.075, J_kgm2, quick=True)
+    assert quick == max(share, QUICK_RAMP_SHARE) * limits.I_test_apk
+    assert TORQUE_OVER * QUICK_RAMP_SHARE * limits.I_test_apk < limits.i_max_apk

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 from pmsmtool.drive.port import Halves
+from pmsmtool.experiments import standstill
 from pmsmtool.experiments.standstill import (
     ARRIVAL_LIMIT_S,
     ARRIVED,
     DC_ANGLE_RAD,
     PAIR_ARRIVED,
     PAIR_SHARES,
+    SWINGING_TURN_S,
     LevelPlan,
     hold_levels,
     hold_pairs,
@@ -111,10 +113,63 @@ def test_a_current_that_does_not_come_at_a_shaft_that_stands_is_not_waited_for()
 
 def test_a_vector_that_is_led_on_reaches_every_angle_forward() -> None:
     """So the rests span 600 degrees (electrical) with as many turns of the vector as there and back."""
-    plan = LevelPlan((1.0, 4.0, -4.0, -1.0, 2.0), 1.5, DC_ANGLE_RAD, onward=True)
+    plan = LevelPlan((1.0, 4.0, -4.0, -1.0, 2.0), 1.5, DC_ANGLE_RAD, quick=True)
     levels = hold_levels(LateDrive(0.0, 0), plan)  # type: ignore[arg-type]
     quarters = levels["theta_imposed_rad"] / DC_ANGLE_RAD
     assert quarters == pytest.approx([1.0, 1.0, 3.0, 3.0, 5.0])
-    assert "theta_imposed_rad" not in hold_levels(LateDrive(0.0, 0), replace(plan, onward=False)).signals  # type: ignore[arg-type]
-    pairs = hold_pairs(LateDrive(0.0, 0), I_A, 1.5, 5.0 * DC_ANGLE_RAD, rests=True)  # type: ignore[arg-type]
+    assert "theta_imposed_rad" not in hold_levels(LateDrive(0.0, 0), replace(plan, quick=False)).signals  # type: ignore[arg-type]
+    pairs = hold_pairs(LateDrive(0.0, 0), I_A, 1.5, 5.0 * DC_ANGLE_RAD, quick=True)  # type: ignore[arg-type]
     assert np.degrees(pairs["theta_imposed_rad"]) == pytest.approx([450.0, 450.0, 570.0, 570.0, 690.0, 690.0])
+
+
+class HeavyDrive(LateDrive):
+    """A load that swings on a small vector for good, until a large one is held that long."""
+
+    LARGE_A, CALM_S = 4.0, 0.1
+
+    def __init__(self) -> None:
+        super().__init__(0.0, 0)
+        self.t = self.held_s = 0.0
+
+    def wait(self, seconds: float) -> None:
+        self.t += seconds
+        self.held_s += seconds * (self.wanted_a >= self.LARGE_A)
+
+    def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
+        self.taken += 1
+        swing = 0.1 * math.cos(3.0 * self.t) if self.held_s < self.CALM_S else 0.0
+        return {name: {"theta_m_rad": swing, "i_d_a": self.wanted_a}.get(name, 0.0) for name in signals}
+
+    def halves(self, signals: Sequence[str], periods: int) -> Halves:
+        first = self.average(signals, periods)
+        self.wait(periods * PERIOD_S)
+        return Halves(first, self.average(signals, periods), periods)
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_a_load_that_swings_on_a_small_level_is_braked_on_the_largest(quick: bool) -> None:
+    """Of a drive with 35 times its inertia every level was refused after 460 s; R after 45 s."""
+    plan = LevelPlan((1.0, 2.0, 4.0), 1.5, DC_ANGLE_RAD, quick=quick)
+    levels = hold_levels(HeavyDrive(), plan)  # type: ignore[arg-type]
+    assert levels["moved"].tolist() == ([0.0, 0.0, 0.0] if quick else [1.0, 1.0, 0.0])
+
+
+def test_a_rotor_that_stands_where_it_stood_needs_one_look() -> None:
+    taken = []
+    for quick in (True, False):
+        drive = HeavyDrive()
+        drive.held_s = drive.CALM_S
+        hold_levels(drive, LevelPlan((1.0, 2.0, 4.0), 1.5, DC_ANGLE_RAD, quick=quick))  # type: ignore[arg-type]
+        taken.append(drive.taken)
+    assert taken == [3 * 3 + 1, 3 * 4]
+
+
+def test_once_a_swing_was_braked_the_vector_turns_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In 0.4 s a load of 36 times the inertia was left behind: L was refused after 318 s; 53 s and a good L so."""
+    turns: list[float] = []
+    monkeypatch.setattr(standstill, "turn_vector", lambda *told: turns.append(told[4]) or told[4])
+    calm = HeavyDrive()
+    calm.held_s = calm.CALM_S
+    for drive in (calm, HeavyDrive()):
+        hold_levels(drive, LevelPlan((1.0, 4.0, -4.0), 1.5, DC_ANGLE_RAD, turn_s=0.4, quick=True))  # type: ignore[arg-type]
+    assert turns == [0.4, SWINGING_TURN_S]
