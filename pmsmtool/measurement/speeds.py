@@ -45,6 +45,10 @@ SECOND_PUSH, FAR = (1.5, 0.6), 0.6
 what the pushes aim at."""
 PUSH_TRIES = 4
 """Pushes in either direction, each of twice the time of the one before."""
+GROWTH, LITTLE_SHARE, GROWN_SHARE, PUSHES_MOST = (2.0, 1.5), 0.1, 0.55, 13
+"""By what the first current grows until the shaft answers, below and above a share of the test current, up to which it
+does, and how often. Twice a current that friction of 37 % of the rated torque held brought a shaft to its speed limit.
+"""
 SPEED_LOOP_RAD_S = 25.0
 RUN_I_D_SHARE, RUN_I_D_MOST = 0.45, 0.8
 """Largest d current of the flux run, of the test current: a third of it is still beyond the inverter's knee."""
@@ -213,15 +217,15 @@ class SpeedStage:
         A second push, of another current, tells what friction took of both.
         """
         current, seconds = FIRST_SHARE * self.limits.I_test_apk, FIRST_S
-        for _ in range(9):
+        for _ in range(PUSHES_MOST):
             change, gained = self._there_and_back(current, seconds, pole_pairs)
             if change > 0.15 * target:
                 times = SECOND_PUSH[0 if change < FAR * target else 1]
                 other, gained_then = self._there_and_back(times * current, seconds, pole_pairs)
                 # friction takes some of it, or nothing
                 return max((other - change) / (gained_then - gained), change / gained)
-            if current < 0.4 * self.limits.I_test_apk:
-                current *= 2.0
+            if current < GROWN_SHARE * self.limits.I_test_apk:
+                current *= GROWTH[current > LITTLE_SHARE * self.limits.I_test_apk]
             else:
                 seconds *= min(4.0, 0.5 * target / max(change, 1e-3 * target))
         raise refuse(

@@ -25,7 +25,7 @@ BIAS_TRIES = 4
 BIAS_OFF_RAD = math.radians(20.0)
 """Angle between rotor and bias vector that a load or friction may make (electrical): the frame then goes to the rotor.
 Friction at rest 1.6 times the Coulomb torque left 7.9 degrees."""
-ALIGN_TRIES = 3
+ALIGN_TRIES = 8
 """Times the frame follows a rotor that was moved by the change of the frame itself."""
 NOISE_RIPPLE = 25.0
 """Smallest ripple, peak to peak, in noise of one sample: an inverter's knee biases less than a ripple that drowns."""

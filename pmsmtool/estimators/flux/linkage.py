@@ -206,6 +206,7 @@ def estimate_flux_linkage(
         RIPPLE_DOUBT * even.change(rows.ripple_q_v),
         CURVE_DOUBT * even.change(rows.curve_q_v),
         CURVATURE_DOUBT * (even.low_wb - even.flux_wb),
+        even.curvature * even.q_share**2 * psi,
         LAG_STD * lag_s * even.change(psi * rows.acceleration_rad_s2),
         0.0 if shown is None else per_instant * math.hypot(shown.std_s, apart_s),
         RELATIVE_FLOOR * psi,
@@ -346,12 +347,16 @@ def _fit_d(rows: Corrected) -> tuple[Array, Array, int]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Even:
-    """Fit of the flux that does not depend on the sign of i_d; ``row`` maps the q voltages of all rows onto it."""
+    """Fit of the flux that does not depend on the sign of i_d; ``row`` maps the q voltages of all rows onto it.
+
+    ``q_share`` is the largest q current beside a d current, over the largest of those: the shaft was driven.
+    """
 
     flux_wb: float
     std_wb: float
     dof: float
     curvature: float
+    q_share: float
     low_wb: float
     low_std_wb: float
     low_i_d_a: float
@@ -401,6 +406,7 @@ def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
     return _Even(flux_wb=value, std_wb=math.sqrt(float(share @ (within + (values - value) ** 2))),
                  dof=float(share @ dof),
                  curvature=sum(float(p * np.sum((hat @ y)[1:])) for p, hat in zip(share, hats, strict=True)) / value,
+                 q_share=float(np.max(np.abs(rows.i_q[np.concatenate([first, second])])) / np.max(level)),
                  low_wb=float(np.average(y[low], weights=weight[low])),
                  low_std_wb=float(np.std(y[low])) / math.sqrt(max(1, int(np.sum(low)) - 1)),
                  low_i_d_a=float(np.mean(level[low])), w=0.5 * w_sum,

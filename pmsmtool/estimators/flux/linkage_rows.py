@@ -27,8 +27,8 @@ SPEED_RATIO = 1.6
 """Largest over smallest speed below which delay and offset are one."""
 PAIR_RATIO = 1.2
 """Ratio of two d currents of opposite sign up to which they are one level."""
-Q_SHARE = 0.3
-"""Part of i_d up to which an i_q counts as none."""
+Q_SHARE = 3.0
+"""Part of i_d up to which a window holds a d current: beside it a q current may keep the speed against friction."""
 CURRENT_SETTLE_LIMIT = 0.25
 """Change of a current between the halves of a window, of the largest current."""
 SETTLE_LIMIT = 0.4
