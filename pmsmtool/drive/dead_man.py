@@ -21,7 +21,7 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe, state_text
 from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat, expect_pdo
-from pmsmtool.errors import SafetyRefusal, SdoAbort
+from pmsmtool.errors import BusError, SafetyRefusal, SdoAbort
 
 CONSUMER_MS = 250
 """Consumer heartbeat time set for the tool: five of its heartbeats."""
@@ -280,7 +280,12 @@ def _start(node: DriveNode) -> None:
     if before is not NmtState.OPERATIONAL:
         send_nmt(node.connection, NmtCommand.START, node.node)
         if before is not NmtState.STOPPED:
-            node.before_close.append(lambda: send_nmt(node.connection, NmtCommand.PRE_OPERATIONAL, node.node))
+
+            def back() -> None:
+                with contextlib.suppress(BusError):  # a lost adapter must not hide that the drive may be energised
+                    send_nmt(node.connection, NmtCommand.PRE_OPERATIONAL, node.node)
+
+            node.before_close.append(back)
 
 
 def set_quick_stop(node: DriveNode, option: int) -> int | None:
