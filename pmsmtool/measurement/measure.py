@@ -261,7 +261,6 @@ class Measurement:
         try:
             curvature, change = self._computed(changes)
         except IdentificationError:
-            self.drive.enable()
             return False  # the evaluation says so
         shown = []
         if abs(curvature) >= SATURATED:
@@ -362,7 +361,11 @@ class Measurement:
     def _computed(self, compute: Callable[[], _Found]) -> _Found:
         """Compute with the drive off: it takes 0.2 to 3 s, and an energised drive waits 0.35 s for a heartbeat."""
         self.drive.disable()
-        found = compute()
+        try:
+            found = compute()
+        except IdentificationError:
+            self.drive.enable()
+            raise
         self.drive.enable()
         return found
 

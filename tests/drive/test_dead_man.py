@@ -7,6 +7,8 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import can
 import pytest
@@ -14,9 +16,9 @@ import pytest
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import WallClock
 from pmsmtool.bus.connect import Connection
-from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE
+from pmsmtool.bus.nmt import HEARTBEAT_ID, TOOL_NODE, NmtCommand, NmtState
 from pmsmtool.cia402 import AbortConnection, FaultReaction, State
-from pmsmtool.drive import objects
+from pmsmtool.drive import dead_man, objects
 from pmsmtool.drive.dead_man import CONSUMER_MS, TRIES, DeadManProof, _fault_without_ramp, prove_dead_man
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat
@@ -216,6 +218,24 @@ def test_an_entry_that_watches_the_tool_already_is_taken_before_a_free_one(bench
     with guarded(bench.drive, ENVELOPE):
         words = [int.from_bytes(sdo.read(0x1016, sub), "little") for sub in (1, 2)]
     assert words == [0, TOOL_NODE << 16 | CONSUMER_MS]
+
+
+def test_a_lost_adapter_hides_no_other_error_of_a_drive_that_was_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exit code 3 of the adapter stood over 8: the drive did not confirm that it stopped."""
+    sent: list[NmtCommand] = []
+
+    def send(connection: Any, command: NmtCommand, node: int) -> None:
+        sent.append(command)
+        if command is NmtCommand.PRE_OPERATIONAL:
+            raise BusError("the adapter is gone")
+
+    monkeypatch.setattr(dead_man, "send_nmt", send)
+    state = SimpleNamespace(nmt_state=NmtState.PRE_OPERATIONAL)
+    node: Any = SimpleNamespace(supervision=state, connection=None, node=5, before_close=[])
+    dead_man._start(node)
+    for restore in node.before_close:
+        restore()
+    assert sent == [NmtCommand.START, NmtCommand.PRE_OPERATIONAL]
 
 
 def test_killed_tool_stops_the_machine(bench: SimBench) -> None:
