@@ -142,7 +142,7 @@ def test_cogging_is_taken_along_with_the_inertia_of_the_fit_before(monkeypatch: 
         raise Enough
 
     for name, value in (
-        ("angle_harmonics", lambda _: cogging), ("_blocks", blocks), ("disturbances", lambda *_: one.disturbances),
+        ("angle_harmonics", lambda *_: cogging), ("_blocks", blocks), ("disturbances", lambda *_: one.disturbances),
         ("_start", lambda _: begun), ("_fit", fit), ("_explained", explained),
     ):  # fmt: skip
         monkeypatch.setattr(mechanics, name, value)
