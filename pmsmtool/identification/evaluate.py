@@ -20,7 +20,7 @@ from pmsmtool.estimators.encoder import (
     estimate_encoder,
 )
 from pmsmtool.estimators.estimate import SensorTolerance, Verdict, total_half_width
-from pmsmtool.estimators.flux.linkage import FluxResult, check_magnet, estimate_flux_linkage
+from pmsmtool.estimators.flux.linkage import FluxResult, check_magnet, estimate_flux_linkage, magnet_change
 from pmsmtool.estimators.flux.map_result import FluxMapResult
 from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.axis_response import initial_inductance
@@ -68,6 +68,9 @@ FIXED = ("levels", "square_", "angle_")
 """Beginnings of the names of traces whose current vector keeps its angle."""
 NOTABLY_WIDER = 1.2
 """Growth of a total interval from which on a reader is told of what makes it wider."""
+MAGNET_MOST = 0.05
+"""Change of the flux linkage over the pulses of a flux map beyond which psi_f is refused, too, relative. A magnet 14 K
+warmer gave 2 % less."""
 MOSFET_LINK_V = 100.0
 """Below this DC link bridges are made of MOSFETs, which have no threshold."""
 
@@ -301,7 +304,9 @@ def evaluate(
             result = attempt("psi", lambda: as_sampled(traces, rough, period_s, alpha_psi_per_k, tolerance)) or replace(
                 rough, flux=None
             )
-    result = attempt("psi", lambda: magnet_checked(traces, result, alpha_psi_per_k)) or replace(result, flux=None)
+    result = attempt("psi", lambda: magnet_checked(traces, result, alpha_psi_per_k, refused)) or replace(
+        result, flux=None
+    )
     if result.inductance is not None and result.flux is not None:
         result = replace(result, inductance=_beside_speeds(result.inductance, result.flux.L_q_app))
     flux_map = attempt("map", lambda: flux_map_of(traces, result, tolerance))
@@ -394,11 +399,32 @@ def as_sampled(
     return replace(result, resistance=resistance, flux=replace(again, shown=flux.shown))
 
 
-def magnet_checked(traces: Mapping[str, Trace], result: Evaluation, alpha_psi_per_k: float) -> Evaluation:
-    """Return the result, unless the magnets give another flux after the pulses of a flux map."""
-    if result.flux is not None and "speeds_after_map" in traces:
-        check_magnet(traces["speeds"], traces["speeds_after_map"], result.flux, alpha_psi_per_k)
-    return result
+def magnet_checked(
+    traces: Mapping[str, Trace], result: Evaluation, alpha_psi_per_k: float, refused: dict[str, IdentificationError]
+) -> Evaluation:
+    """Return the result; where the magnets give another flux after the pulses of a flux map, the map is refused.
+
+    psi_f then holds the flux before and after them. Raises IdentificationError: ``E_MAGNET_CHANGED``: it changed by
+    more than :data:`MAGNET_MOST`.
+    """
+    flux = result.flux
+    if flux is None or "speeds_after_map" not in traces:
+        return result
+    windows = traces["speeds"], traces["speeds_after_map"]
+    try:
+        check_magnet(*windows, flux, alpha_psi_per_k)
+        return result
+    except IdentificationError as refusal:
+        change = magnet_change(*windows, alpha_psi_per_k)
+        if not abs(change) <= MAGNET_MOST:
+            raise
+        refused.setdefault("map", refusal)
+    told = f"it changed by {100.0 * change:.2g} % over the pulses of the flux map: warmer, or demagnetised in part"
+    psi_f, measured = (
+        replace(e, std=math.hypot(e.std, change * e.value), fallback="; ".join(filter(None, (e.fallback, told))))
+        for e in (flux.psi_f, flux.psi_measured)
+    )
+    return replace(result, flux=replace(flux, psi_f=psi_f, psi_measured=measured))
 
 
 def modulation_of(

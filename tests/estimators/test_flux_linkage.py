@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from pmsmtool.estimators.injection.inductance import InductanceResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling
 from pmsmtool.estimators.injection.switching_ripple import Modulation
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.identification.evaluate import _beside_speeds
+from pmsmtool.identification.evaluate import Evaluation, _beside_speeds, magnet_checked
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 from tests.estimators.plant import Drives, curve_points, draw, repeat, run
@@ -428,6 +429,19 @@ def test_a_magnet_that_lost_flux_is_told_from_a_warmer_one(T_after_c: float, pop
     for share in (1.0 - 1.1 * MAGNET_CHANGE, 1.0 + 1.1 * MAGNET_CHANGE, 0.97, math.nan):
         with pytest.raises(IdentificationError, match="E_MAGNET_CHANGED"):
             check_magnet(before, again(share), flux, alpha)
+    # a little less takes the flux map along, and psi_f holds it; a magnet that lost more, or none, does not
+    for change, refused_map in ((0.0, False), (-0.02, True)):
+        refused: dict[str, IdentificationError] = {}
+        traces = {"speeds": before, "speeds_after_map": again(1.0 + change)}
+        nothing: Any = None
+        found = magnet_checked(traces, Evaluation(nothing, flux=flux), alpha, refused).flux
+        assert found is not None and (list(refused) == ["map"]) == refused_map
+        wider = math.hypot(flux.psi_f.std, change * flux.psi_f.value)
+        assert found.psi_f.std == pytest.approx(wider, rel=1e-3) and bool(found.psi_f.fallback) >= refused_map
+    for share in (0.94, math.nan):
+        lost = {"speeds": before, "speeds_after_map": again(share)}
+        with pytest.raises(IdentificationError, match="E_MAGNET_CHANGED"):
+            magnet_checked(lost, Evaluation(nothing, flux=flux), alpha, {})
 
 
 @pytest.mark.parametrize(("share", "lost"), [(0.9, False), (1.1, True)])

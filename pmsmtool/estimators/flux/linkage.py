@@ -293,26 +293,11 @@ def with_driven(coasting: Estimate, driven: Estimate) -> Estimate:
 
 
 def check_magnet(before: Trace, again: Trace, flux: FluxResult, alpha_psi_per_k: float) -> None:
-    """Compare the flux linkage of two windows with the one of the same two windows later.
-
-    Gains, inverter error and saturation are those of both, and cancel.
+    """Compare the flux linkage of two windows with the one of the same two windows later (:func:`magnet_change`).
 
     Raises IdentificationError: ``E_MAGNET_CHANGED``.
-
-    Parameters
-    ----------
-    before, again : Trace
-        Rows of a run over speeds; the two rows of ``again`` repeat ``fastest_pair`` of ``before``.
-    flux : FluxResult
-        Of the run before; its residuals say how well one pair is known.
-    alpha_psi_per_k : float
-        Temperature coefficient of the magnet flux (1/K).
     """
-    pairs = (before, list(fastest_pair(before))), (again, [0, 1])
-    psi = [float(np.mean(rows["u_q_v"][at] / rows["omega_e_rad_s"][at])) for rows, at in pairs]
-    T = [float(np.mean(rows["T_magnet_c"][at])) for rows, at in pairs]
-    warmer = T[1] - T[0] if np.all(np.isfinite(T)) else 0.0  # without a sensor a few seconds count as none
-    change = psi[1] / (psi[0] * (1.0 + alpha_psi_per_k * warmer)) - 1.0
+    change = magnet_change(before, again, alpha_psi_per_k)
     scatter = float(np.sqrt(np.mean(flux.residual_wb**2))) / flux.psi_measured.value
     limit = max(MAGNET_CHANGE, PAIR_SCATTERS * math.sqrt(2.0) * scatter)
     if not abs(change) <= limit:
@@ -321,6 +306,25 @@ def check_magnet(before: Trace, again: Trace, flux: FluxResult, alpha_psi_per_k:
             f"the flux linkage changed by {100.0 * change:.2g} % over the pulses, limit {100.0 * limit:.2g} %",
             stage="flux map",
         )
+
+
+def magnet_change(before: Trace, again: Trace, alpha_psi_per_k: float) -> float:
+    """Return the relative change of the flux linkage of two windows, beside that of a magnet whose warmth is shown.
+
+    Gains, inverter error and saturation are those of both, and cancel.
+
+    Parameters
+    ----------
+    before, again : Trace
+        Rows of a run over speeds; the two rows of ``again`` repeat ``fastest_pair`` of ``before``.
+    alpha_psi_per_k : float
+        Temperature coefficient of the magnet flux (1/K).
+    """
+    pairs = (before, list(fastest_pair(before))), (again, [0, 1])
+    psi = [float(np.mean(rows["u_q_v"][at] / rows["omega_e_rad_s"][at])) for rows, at in pairs]
+    T = [float(np.mean(rows["T_magnet_c"][at])) for rows, at in pairs]
+    warmer = T[1] - T[0] if np.all(np.isfinite(T)) else 0.0  # without a sensor a few seconds count as none
+    return psi[1] / (psi[0] * (1.0 + alpha_psi_per_k * warmer)) - 1.0
 
 
 def _fit_d(rows: Corrected) -> tuple[Array, Array, int]:
