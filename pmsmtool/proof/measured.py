@@ -33,8 +33,11 @@ KEPT = (-0.05, 0.02)
 ATTEMPTS = 3
 """A record that begins at another speed is taken again, this often in all."""
 STATE = ("omega_e_rad_s", "i_d_a", "i_q_a", "u_d_lim_v", "u_q_lim_v", "U_dc_v")
-STATE_S = 0.02
-"""Averaged over this time, it shows why a speed was not reached."""
+STATE_S, TURN_MOST_S = 0.02, 2.0
+"""Averaged over a turn of the shaft, within these times, it shows whether and why a speed was not reached: friction
+over the angle swung one by 8 % within a turn."""
+AT_SPEED, PASSING_S = 0.01, 0.01
+"""Relative distance from its speed at which the record of a shaft that swings begins, looked for this often (s)."""
 ALL_IN_D = 0.95
 """Share of i_d in a current vector that leaves next to no torque."""
 USED_UP = 0.95
@@ -115,9 +118,12 @@ def _recorded(
         if omega_e:
             crossover = float(design.facts.get("speed_crossover_rad_s", math.inf))
             limit_s = max(REACH_S, _ramp_s(drive, experiment.base_rad_s, pole_pairs), REACH_TIMES / crossover)
-            if reach(drive, omega_e, limit_s=limit_s) >= limit_s:
+            swings = reach(drive, omega_e, limit_s=limit_s) >= limit_s
+            if swings:
                 _refuse_other_speed(drive, experiment, omega_e, limit_s, design, conditions)
             drive.wait(experiment.settle_s)
+            if swings:
+                _await_passing(drive, omega_e, _turn_s(experiment))
         if experiment.move is not None:
             return _moved(drive, experiment, design)
         trace = drive.record(experiment.signals, experiment.rows, decimation=experiment.decimation,
@@ -131,6 +137,19 @@ def _recorded(
         f"{experiment.base_rad_s / RAD_S_PER_RPM:.4g} rpm, or {100.0 * KEPT[1]:g} % above",
         likely="the shaft coasts too long while the bus or this computer is slow, or something brakes or drives it",
     )
+
+
+def _turn_s(experiment: Experiment) -> float:
+    """Return the time of a turn of the shaft, within bounds (s)."""
+    return min(TURN_MOST_S, max(STATE_S, 2.0 * math.pi / abs(experiment.base_rad_s)))
+
+
+def _await_passing(drive: Drive, omega_e_rad_s: float, turn_s: float) -> None:
+    """Wait until a shaft that swings about its speed passes it, for a turn at most."""
+    for _ in range(math.ceil(turn_s / PASSING_S)):
+        if abs(drive.live("omega_e_rad_s") - omega_e_rad_s) <= AT_SPEED * abs(omega_e_rad_s):
+            break
+        drive.wait(PASSING_S)
 
 
 def _moved(drive: Drive, experiment: Experiment, design: Design) -> Trace:
@@ -147,7 +166,7 @@ def _refuse_other_speed(
     drive: Drive, experiment: Experiment, omega_e_rad_s: float, limit_s: float, design: Design, conditions: Conditions
 ) -> None:
     """Raise when the machine is not near the speed it should have reached."""
-    state = drive.average(STATE, max(1, round(STATE_S / drive.period_s)))
+    state = drive.average(STATE, max(1, round(_turn_s(experiment) / drive.period_s)))
     limited = bool(round(drive.live("flags")) & CURRENT_LIMITED)
     omega = state["omega_e_rad_s"]
     if abs(omega - omega_e_rad_s) <= REACHED * abs(omega_e_rad_s):

@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import can
@@ -381,6 +383,42 @@ def test_what_the_drive_shows_tells_why_a_speed_is_not_reached(
     state = {"i_d_a": -0.5, "i_q_a": 1.0, "u_d_lim_v": -20.0, "u_q_lim_v": 100.0, "U_dc_v": 540.0, **changed}
     at_rest = Conditions(540.0, 25.0, 25.0, 1 << 17, 5.0, 300.0)
     assert reason in measured._why_not(state, limited, design, at_rest)
+
+
+def test_a_shaft_that_swings_about_its_speed_within_a_turn_has_reached_it(design: Design) -> None:
+    """Friction over the angle: 97 of 90 rpm over 20 ms, and `prove` failed."""
+    turn_s = 0.67
+    omega_e = design.machine.machine.pole_pairs * 2.0 * math.pi / turn_s
+
+    class Swinging:
+        """Its speed is 8 % above its mean at once, and passes the mean a quarter of a turn later."""
+
+        period_s, now_s = 1e-4, 0.0
+
+        def live(self, name: str) -> float:
+            return 0.0 if name == "flags" else self._omega(self.now_s)
+
+        def _omega(self, t_s: float) -> float:
+            return float(omega_e * (1.0 + 0.08 * math.cos(2.0 * math.pi * t_s / turn_s)))
+
+        def wait(self, seconds: float) -> None:
+            self.now_s += seconds
+
+        def average(self, names: Sequence[str], periods: int) -> dict[str, float]:
+            times = self.now_s + self.period_s * np.arange(periods)
+            return dict.fromkeys(names, 0.0) | {"omega_e_rad_s": float(np.mean([self._omega(t) for t in times]))}
+
+    drive: Any = Swinging()
+    steps: Any = SimpleNamespace(base_rad_s=2.0 * math.pi / turn_s, name="q_steps")
+    at_rest = Conditions(540.0, 25.0, 25.0, 1 << 17, 5.0, 300.0)
+    measured._refuse_other_speed(drive, steps, omega_e, 6.0, design, at_rest)
+    measured._await_passing(drive, omega_e, measured._turn_s(steps))
+    assert abs(drive.live("omega_e_rad_s") / omega_e - 1.0) <= measured.AT_SPEED
+    assert drive.now_s == pytest.approx(0.25 * turn_s, abs=2.0 * measured.PASSING_S)
+    short: Any = SimpleNamespace(base_rad_s=1e3, name="q_steps")
+    drive.now_s = 0.0
+    with pytest.raises(measured.SpeedNotReached, match="the speed was not reached"):
+        measured._refuse_other_speed(drive, short, omega_e, 6.0, design, at_rest)
 
 
 @pytest.mark.parametrize("slow", [1, 99])
