@@ -123,6 +123,7 @@ def _recorded(
                 _refuse_other_speed(drive, experiment, omega_e, limit_s, design, conditions)
             drive.wait(experiment.settle_s)
             if swings:
+                say("the shaft swings about its speed: the record begins where it passes it")
                 _await_passing(drive, omega_e, _turn_s(experiment))
         if experiment.move is not None:
             return _moved(drive, experiment, design)

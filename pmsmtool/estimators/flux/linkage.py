@@ -55,7 +55,7 @@ RIPPLE_DOUBT = 0.1
 """Standard deviation of the ripple's share of the inverter error, relative. Beside the bridge's thresholds psi is off
 by 0.028 % rms on 52 random drives whose dead time takes more than 3 R I, where that share is 0.1 to 2 % of it."""
 CURVE_DOUBT = 0.15
-"""The same of what the measured curve says about the small i_q that is left."""
+"""The same of what the measured curve says about the i_q that is left, or held against friction."""
 CURVATURE_DOUBT = 0.2
 """Standard deviation of the way from the smallest d current to none, relative (measured on five reluctance machines
 that saturate, whose way is 0.5 %: 0.01 to 0.5)."""
