@@ -38,7 +38,10 @@ OCTAL = re.compile("0[0-7]+")
 NODE_ID_WORD = re.compile(r"\$(?:MY_)?NODE_?ID", re.IGNORECASE)
 """Name of the node id in a number; one maker's files spell it otherwise."""
 _ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
-_WORDED = {"readwrite": "rw", "read": "ro", "readonly": "ro", "write": "wo", "writeonly": "wo", "constant": "const"}
+_WORDED = {"readwrite": "rw", "read": "ro", "readonly": "ro", "write": "wo", "writeonly": "wo", "constant": "const",
+           "r": "ro", "w": "wo"}  # fmt: skip
+_INT, _LONG = re.compile(r"(U?)INT(8|16|32|64)\Z"), {"": "INTEGER", "U": "UNSIGNED"}
+"""Types as programs name them."""
 _NOT_LETTERS = re.compile(r"[^a-z]")
 OTHER_FILES = {
     b"<": "a device description in XML (XDD, XDC, ESI), or a page of the web, is no EDS or DCF",
@@ -189,6 +192,8 @@ def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Ed
             heads[address[0]] = section
         elif address is not None and section.get("datatype"):
             records.add(address[0])
+        elif address is None and section.get("datatype"):
+            warnings.append(f"{where}:{section.line}: [{section.name}] has a DataType and names no object, left out")
     for section in sections.values():
         for entry in _objects_of(section, sections, heads, records, node, where, warnings):
             objects.setdefault((entry.index, entry.sub), entry)
@@ -324,7 +329,7 @@ def _entry(
     place: str,
     warnings: list[str],
 ) -> EdsObject:
-    word = DATA_TYPES.get(section.get("datatype").upper())
+    word = DATA_TYPES.get(_INT.sub(lambda found: f"{_LONG[found[1]]}{found[2]}", section.get("datatype").upper()))
     data_type = word.code if word else _number(section.get("datatype"), None, f"{place} DataType", warnings)
     if not isinstance(data_type, int):
         data_type = DOMAIN if kind == _DOMAIN_OBJECT else 0
@@ -362,8 +367,8 @@ def _entry(
 def _number(
     text: str, data_type: int | None, place: str, warnings: list[str], node: int | None = None
 ) -> int | float | None:
-    """Return a number, or None with a warning when it is none; empty is None without one."""
-    if not text:
+    """Return a number, or None with a warning when it is none; empty, or a remark alone, is None without one."""
+    if not without_remark(text):
         return None
     try:
         if data_type in (REAL32, REAL64):

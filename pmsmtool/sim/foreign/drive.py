@@ -20,7 +20,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.families import assumed_modes, family_of, laws_of, modes_of, units_of
-from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects, oddities_of, read_makers_objects
+from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects, read_makers_objects
 from pmsmtool.sim.foreign.laws import Law
 from pmsmtool.sim.foreign.position import PositionLoop
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
@@ -210,8 +210,8 @@ def assumptions_of(file: str, machine_file: MachineFile | None = None) -> tuple[
         )  # fmt: skip
     assumed = assumed_modes(objects)
     modes = ", ".join(str(bit + 1) for bit in range(16) if assumed >> bit & 1)
-    lines = oddities_of(file) + (
-        [f"0x6502 is blank: modes {modes} are assumed by its objects; a real drive reports its own"] if assumed else []
+    lines = objects.odd + (
+        (f"0x6502 is blank: modes {modes} are assumed by its objects; a real drive reports its own",) if assumed else ()
     )
     return (*lines, *(() if machine_file is None else ForeignDrive(objects, set_up_of(machine_file)).unheld))
 

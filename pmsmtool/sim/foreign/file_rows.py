@@ -12,10 +12,11 @@ import csv
 import io
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 from pmsmtool.data_types import BY_SHORT
-from pmsmtool.drive_maps.eds import NODE_ID_WORD, decode, parse_eds, parse_integer, parse_real, without_remark
+from pmsmtool.drive_maps.eds import NODE_ID_WORD, Eds, decode, parse_eds, parse_integer, parse_real, without_remark
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import read_bytes
 from pmsmtool.sim.node.objects import ObjectRow, object_rows
@@ -81,11 +82,14 @@ class MakersObjects:
         Every object, sorted.
     assumed : tuple of str
         What is not the file's, one line each.
+    odd : tuple of str
+        Lines of an EDS or DCF that had to be interpreted, the first few, one line each.
     """
 
     name: str
     rows: Mapping[tuple[int, int], ObjectRow]
     assumed: tuple[str, ...]
+    odd: tuple[str, ...] = ()
 
     def stored(self, index: int, sub: int = 0) -> int:
         """Return the whole number that the file says an object holds; 0 where it says none."""
@@ -102,12 +106,21 @@ def read_makers_objects(where: str) -> MakersObjects:
 
     Raises ConfigError: the file cannot be read, holds no objects, or is no file of a drive (CiA 402).
     """
+    path, _ = _path_and_family(where)
+    hint = "give the EDS or DCF that the drive's maker offers, or TABLE.csv#FAMILY"
+    return _read(read_bytes(path, hint=hint), where)
+
+
+@lru_cache(maxsize=2)
+def _read(data: bytes, where: str) -> MakersObjects:
+    """Keep the last files: one command asks for the same one several times, and 12 000 objects take seconds."""
     path, family = _path_and_family(where)
-    data = read_bytes(path, hint="give the EDS or DCF that the drive's maker offers, or TABLE.csv#FAMILY")
+    odd: tuple[str, ...] = ()
     if path.suffix.lower() == ".csv":
         found, label = dict(_of_table(data, path, family)), family
     else:
-        found, label = dict(_of_eds(data, path)), path.stem
+        eds = parse_eds(data, str(path), NODE_ID)
+        found, label, odd = dict(_of_eds(data, eds)), path.stem, _first_of(eds.warnings, f"{path}:")
     has_words = {(0x6040, 0), (0x6041, 0)} <= set(found)
     stated = MakersObjects(label, found, ()).stored(0x1000) & 0xFFFF  # by the file itself
     rows, assumed = _completed(found)
@@ -119,15 +132,12 @@ def read_makers_objects(where: str) -> MakersObjects:
             likely="a controller of another profile, or a master, which is neither simulated nor moved",
             hint="give the EDS or DCF of a drive",
         )
-    return MakersObjects(label, rows, assumed)
+    return MakersObjects(label, rows, assumed, odd)
 
 
-def oddities_of(where: str) -> list[str]:
-    """Return what is odd about an EDS or DCF, one line each, the first few; nothing of a table."""
-    path, family = _path_and_family(where)
-    found = () if family else parse_eds(read_bytes(path), "line", NODE_ID).warnings
-    told = [text.replace("line:", "line ", 1) for text in found[:SHOWN]]
-    return [*told, *([f"and {len(found) - SHOWN} more of that kind"] if len(found) > SHOWN else [])]
+def _first_of(warnings: tuple[str, ...], place: str) -> tuple[str, ...]:
+    told = [f"line {text.removeprefix(place)}" for text in warnings[:SHOWN]]
+    return (*told, *([f"and {len(warnings) - SHOWN} more of that kind"] if len(warnings) > SHOWN else []))
 
 
 def _path_and_family(where: str) -> tuple[Path, str]:
@@ -136,13 +146,14 @@ def _path_and_family(where: str) -> tuple[Path, str]:
     return (Path(name), family) if name.lower().endswith(".csv") else (Path(where), "")
 
 
-def _of_eds(data: bytes, path: Path) -> Iterator[tuple[tuple[int, int], ObjectRow]]:
-    eds = parse_eds(data, str(path), NODE_ID)
+def _of_eds(data: bytes, eds: Eds) -> Iterator[tuple[tuple[int, int], ObjectRow]]:
     identity = {1: eds.vendor, 2: eds.product, 3: eds.revision}
     read = _as_canopen_reads(decode(data)[0])
     for (index, sub), entry in eds.objects.items():
         ours = entry.data_type, entry.access, entry.value or entry.default
         data_type, access, value = read.get((index, sub), ours)
+        if access not in _ACCESS:  # ``canopen`` keeps "Read/Write" as it is
+            access = entry.access
         if index == 0x1018 and not value and identity.get(sub) is not None:
             value = str(identity[sub])
         kind = _CODES.get(data_type, "DOMAIN")
@@ -286,8 +297,7 @@ def _completed(
     for word in _mapped_words(found):
         kind, value = _MAPPED_AS.get(word & 0xFF, ("VSTR", ""))
         add([(word >> 16, word >> 8 & 0xFF, kind, "ro", value)], "named by the mapping of a PDO")
-    for index in sorted({index for index, sub in found if sub}):
-        highest = max(sub for at, sub in found if at == index)
+    for index, highest in sorted(dict(sorted(at for at in found if at[1])).items()):
         if index in MAPPINGS:
             add([(index, 0, "U8", "rw", str(_named(found, index)))], "number of entries")
         add([(index, 0, "U8", "const", str(highest))], "number of entries")
