@@ -241,3 +241,6 @@ _GROUPS: dict[int, str] = {
     0xF0: "additional functions",
     0xFF: "manufacturer-specific error",
 }
+
+LEAST_LINK_V = 5.0
+"""A DC link below this has no supply; the smallest drives work from about 10 V. Above it 0x6079 counts mV."""

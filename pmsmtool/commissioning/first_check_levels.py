@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pmsmtool.cia402 import LEAST_LINK_V
 from pmsmtool.commissioning.first_check import (
     CURRENT_SHARE,
     DURATION_S,
@@ -52,6 +53,8 @@ from pmsmtool.measurement.by_pulses import envelope_of
 from pmsmtool.measurement.capabilities import Capabilities
 from pmsmtool.trace import Trace
 
+UNITS = {"V": 1e3, "0.1 V": 1e2, "0.01 V": 10.0}
+"""What makers count in 0x6079 in place of mV, and how much more that is."""
 UNSEEN = {
     "supply": "the drive does not show its DC link (0x6079)",
     "phases": "the drive shows no current of a single phase",
@@ -125,7 +128,7 @@ def check_below_full(
         rows += [_counts(moving, stated), *_held_pole_pairs(drive, stated)]
         rest_v = _link_v(moving)
         if rest_v is not None:
-            rows.append(judge_supply(rest_v, None, stated.inverter.U_dc_v))
+            rows.append(_supply(rest_v, None, stated.inverter.U_dc_v))
         if any(row.verdict == WRONG for row in rows):
             return _whole(rows, turns)  # nothing is energised against what is known to be wrong
         i_a = envelope.i_max_apk / HEADROOM
@@ -149,7 +152,7 @@ def check_below_full(
                     turn = push_forth_and_back(guard, i_a, speed_rad_s, link=rest_v is not None)
                     judged = judge_kept(turn) or judge_push(turn)
                 if rest_v is not None:
-                    judged.append(judge_supply(rest_v, turn, stated.inverter.U_dc_v))
+                    judged.append(_supply(rest_v, turn, stated.inverter.U_dc_v))
             rows = [row for row in rows if row.looked_at not in {each.looked_at for each in judged}] + judged
         except IdentificationError as error:
             rows.append(unmoved(error, turns, i_a / rated_of(drive, stated)))
@@ -226,6 +229,19 @@ def _link_v(drive: StandardDrive) -> float | None:
         return drive.live("U_dc_v")
     except NotAvailable:
         return None
+
+
+def _supply(rest_v: float, turn: Trace | None, stated_v: float | None) -> Finding:
+    """Judge the DC link (V); one that is the stated one in another unit than mV is not known, not wrong."""
+    if stated_v and rest_v < LEAST_LINK_V:
+        for unit, factor in UNITS.items():
+            if judge_supply(factor * rest_v, None, stated_v).verdict != OK:
+                continue
+            fallen = judge_supply(rest_v, turn, None)
+            shown = f"0x6079 shows {1e3 * rest_v:.0f}: no mV (CiA 402), but {unit} of the stated {stated_v:.4g} V"
+            odd = Finding("supply", NOT_CHECKED, shown, "state its unit in a map of your own ([signals] U_dc_v)")
+            return odd if fallen.verdict == OK else fallen
+    return judge_supply(rest_v, turn, stated_v)
 
 
 def _counts(drive: StandardDrive, stated: MachineFile) -> Finding:

@@ -16,6 +16,7 @@ from pmsmtool.bus.supervision import Supervision
 from pmsmtool.cia402 import (
     ERROR_CAUSES,
     EXCITATION_ABORTED,
+    LEAST_LINK_V,
     Command,
     State,
     Status,
@@ -37,8 +38,6 @@ STORE_TIMEOUT_S = 10.0
 STORE_POLL_S = 0.1
 READY_TIMEOUT_S = 3.0
 """After boot-up a node answers SDO requests within this time."""
-LEAST_LINK_V = 5.0
-"""A DC link below this has no supply; the smallest drives of this kind work from about 10 V."""
 POLL_S = 0.005
 LOOKS, MEAN_ANSWER_S = 8, 0.1
 """Answers that are timed before a first motion, and their largest mean: a slow gateway takes some tens of ms."""
@@ -315,7 +314,9 @@ class DriveNode:
         if link_mv is None:
             return "no DC-link voltage, or a missing hardware enable or safe-torque-off input"
         if 1e-3 * link_mv < LEAST_LINK_V:
-            return f"the supply of the power stage is off: the DC link has {1e-3 * link_mv:.3g} V"
+            return (
+                f"the supply of the power stage is off: the DC link has {1e-3 * link_mv:.3g} V, where 0x6079 counts mV"
+            )
         return f"the safe-torque-off (STO) or enable input is open; the DC link has {1e-3 * link_mv:.4g} V"
 
     def disable_voltage(self, timeout_s: float = STATE_TIMEOUT_S) -> State | None:

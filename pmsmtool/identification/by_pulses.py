@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from pmsmtool.cia402 import LEAST_LINK_V
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
 from pmsmtool.estimators.estimate import SENSOR_GAIN_TOLERANCE, SensorTolerance, total_half_width
@@ -198,7 +199,8 @@ def pulse_result(
     """
     tolerance = tolerance or SensorTolerance()
     if tolerance.bridge_difference_v is not None:
-        tolerance = tolerance_on(tolerance, facts.U_dc_v or math.inf)
+        shown = facts.U_dc_v >= LEAST_LINK_V
+        tolerance = tolerance_on(tolerance, facts.U_dc_v if shown else math.inf)
     traces = calibrated_traces(traces, tolerance)
     if facts.kind == Method.RECORDER:
         return _by_recorder(traces, facts, tolerance, copper or Copper(), alpha_psi_per_k)
@@ -306,7 +308,9 @@ def _by_torque(
                 tolerance=tolerance,
             )  # fmt: skip
         else:
-            missing["psi_f_wb"] = below_voltage(facts, utilisation, psi_f_wb) if facts.voltage else NO_LINK
+            missing["psi_f_wb"] = (
+                below_voltage(facts, utilisation, psi_f_wb) if facts.voltage else no_link(facts.U_dc_v)
+            )
     except IdentificationError as error:
         missing["psi_f_wb"] = error.what
     if too_wide is not None and not estimates:
@@ -341,6 +345,16 @@ def over_torque_constant(ratios: Mapping[str, Estimate]) -> dict[str, Estimate]:
         )
         for key, e in ratios.items()
     }  # fmt: skip
+
+
+def no_link(U_dc_v: float) -> str:
+    """Return what the flux linkage needs, with the DC link (V) that an energised drive shows; 0: it shows none."""
+    if not U_dc_v:
+        return NO_LINK
+    return (
+        f"{NO_LINK}: the drive is energised and shows a DC link of {U_dc_v:.3g} V, so that 0x6079 does not count mV; "
+        "state its unit in a map of your own ([signals] U_dc_v)"
+    )
 
 
 def below_voltage(facts: PulseFacts, utilisation: float, psi_f_wb: float) -> str:

@@ -15,7 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pmsmtool.cia402 import HOMING_LOST
+from pmsmtool.cia402 import HOMING_LOST, LEAST_LINK_V
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive, guarded
@@ -46,6 +46,7 @@ from pmsmtool.identification.by_pulses import (
     Voltage,
     dump_facts,
     evaluated_stage,
+    no_link,
     why_no_push,
 )
 from pmsmtool.identification.request import IdentifyRequest, Method
@@ -117,11 +118,13 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say)
         omega_failure_rad_s=OVERSHOOT * largest, off_s=OFF_S,
     )  # fmt: skip
     shows_voltage = all(name in drive.node.map.signals for name in ("u_d_v", "u_q_v"))
-    U_dc = _link_v(drive)
     drive.top_rad_s = ASKED_SHARE * largest
     limit: list[str] = []
     with guarded(drive, envelope, say=say) as guard:
         guard.enable()
+        U_dc = _link_v(drive)
+        if 0.0 < U_dc < LEAST_LINK_V:
+            say(no_link(U_dc))
         say(f"J/psi, tau_c/psi: torque pulses up to {max(plan.shares) * plan.i_test_a:.3g} A, polled")
 
         def answered(answer: ShaftAnswer) -> None:
@@ -132,12 +135,12 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say)
         if shows_voltage:
             say("psi: the voltage of the coasting machine")
             coast_both_ways(guard, plan, answer, ("theta_m_rad", "u_d_v", "u_q_v"), keep)
-        elif U_dc > 0.0:
+        elif U_dc >= LEAST_LINK_V:
             say("psi: the speed at which the voltage ends")
             top = run_to_voltage(guard, plan, answer)
             if top is not None:
                 keep("voltage_limit", top)
-    voltage: Voltage = "machine" if shows_voltage else "link" if U_dc > 0.0 else ""
+    voltage: Voltage = "machine" if shows_voltage else "link" if U_dc >= LEAST_LINK_V else ""
     return PulseFacts(
         Method.STANDARD, pushed=True, voltage=voltage, top_rpm=plan.omega_top_rad_s / RAD_S_PER_RPM,
         U_dc_v=max(0.0, U_dc), current_undecided=drive.current_undecided, limit="".join(limit),

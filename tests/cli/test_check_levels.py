@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 
 from benchmarks.random_drives import draw_drive
+from pmsmtool.commissioning.first_check_levels import _supply as link_row
 from pmsmtool.commissioning.first_check_levels import beyond, judge_kept
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import LimitExceeded
 from pmsmtool.experiments.first_turn import WAY_RAD, push_forth_and_back
+from pmsmtool.identification.by_pulses import NO_LINK, no_link
 from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG, judge_current, judge_pulses, judge_push
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
@@ -245,3 +247,19 @@ def test_identify_names_wrong_wiring_of_an_epos4(tool: Tool, key: str, code: int
     channel = f"interior-2k2?nv=:memory:&drive=epos4&{key}"
     got, out, told = tool("-i", "pmsmsim", "-c", channel, "identify", "mechanics", "--yes")
     assert got == code and named in out + told
+
+
+@pytest.mark.parametrize(("counts", "unit"), [(48, "V"), (480, "0.1 V"), (4700, "0.01 V")])
+def test_a_link_in_another_unit_is_no_supply_that_is_off(counts: int, unit: str) -> None:
+    """A drive whose 0x6079 counts volts had its supply WRONG, and nothing else was looked at."""
+    row = link_row(1e-3 * counts, None, 48.0)
+    assert row.verdict == NOT_CHECKED and f"0x6079 shows {counts}: no mV (CiA 402), but {unit} of" in row.shown
+    sagging = Trace(np.zeros(2), {"U_dc_v": 1e-3 * counts * np.array([1.0, 0.5])}, {"U_dc_v": "V"})
+    assert link_row(1e-3 * counts, sagging, 48.0).verdict == WRONG
+    assert link_row(1e-3 * counts, None, 300.0).verdict == WRONG
+
+
+def test_a_link_that_an_energised_drive_cannot_have_tells_no_flux_linkage() -> None:
+    """0.048 V: the flux linkage was a thousandth, and was what was blamed."""
+    assert "0.048 V, so that 0x6079 does not count mV" in no_link(0.048)
+    assert no_link(0.0) == NO_LINK

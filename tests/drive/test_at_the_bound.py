@@ -10,9 +10,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from pmsmtool.cia402 import LEAST_LINK_V
 from pmsmtool.drive import motion_objects as motion
 from pmsmtool.drive import objects
-from pmsmtool.drive.drive_node import LEAST_LINK_V
 from pmsmtool.drive.mapped_recorder_drive import LINEAR_SHARE, MappedRecorderDrive
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.parameters import DriveParameters
@@ -66,7 +66,12 @@ def test_a_makers_record_by_the_names_asked_for() -> None:
 
 
 @pytest.mark.parametrize(
-    ("link_v", "said"), [(LEAST_LINK_V - 1e-3, "is off: the DC link has 5 V"), (LEAST_LINK_V, "5 V"), (24.0, "24 V")]
+    ("link_v", "said"),
+    [
+        (LEAST_LINK_V - 1e-3, "is off: the DC link has 5 V, where 0x6079 counts mV"),
+        (LEAST_LINK_V, "5 V"),
+        (24.0, "24 V"),
+    ],
 )
 def test_the_link_tells_the_supply_from_the_inputs(link_v: float, said: str) -> None:
     with node_of({objects.DC_LINK_MV: round(1e3 * link_v)}) as (_, node):
