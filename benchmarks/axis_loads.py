@@ -120,6 +120,8 @@ LEARNED = {
     "faulhaber": "faulhaber",
 }  # fmt: skip
 """Map of the families of a table whose gains `map learn` must find first."""
+UNABLE = "following error"
+"""What ends a move that the stored gains cannot do: the shaft swings, or does not come nearer. Its ratio is 0."""
 SHARE_OF_ACCELERATION, FASTEST, CALM = 0.5, 300.0, 100.0
 """Acceleration of the compared move: of the designed one, and its largest (rad/s2); with learned gains."""
 
@@ -179,18 +181,21 @@ def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float
         if family in LEARNED:  # the stored gains are for the motor alone
             speed, acceleration = "40rpm", min(acceleration, CALM)
         move = ("move", "--by", "60deg", "--speed", speed, "--acceleration", f"{acceleration:.4g}", *drive, "--yes")
-        before = done(*move)
+        code, before, reason = asked(*move, "--json")
+        if code != 0 and not reason.startswith(UNABLE):
+            raise RuntimeError(f"move: exit {code}: {reason}")
         done("flash-params", "axis.toml", *drive, "--yes")
         after = done(*move)
-        runs = [RunDirectory(Path(one["run"])).read().stage("move") for one in (before, after)]
-    errors = [math.degrees(one["move"]["error_peak_rad"]) for one in (before, after)]
+        runs = [RunDirectory(Path(one["run"])).read().stage("move") for one in (before, after) if "run" in one]
+    errors = [math.degrees(one["move"]["error_peak_rad"]) if one else math.inf for one in (before, after)]
     phase = min(float(made["facts"][f"axis_{loop}_phase_least_deg"]) for loop in ("speed", "position"))
     peak = max(float(made["facts"][f"axis_{loop}_S_peak_db"]) for loop in ("speed", "position"))
     seconds = sum(run.seconds for run in runs if run is not None)
     ratio = errors[1] / errors[0]
+    stored = f"{errors[0]:.3g} deg" if math.isfinite(errors[0]) else f"cannot do it ({reason})"
     line = (
         f"{known.machine.resonance_hz:.0f} Hz, load {float(made['facts']['axis_load_ratio']):.2g}: stored "
-        f"{errors[0]:.3g} deg, with --stored x {ratio:.2f} ({phase:.0f} deg, {peak:.1f} dB, {seconds:.0f} s)"
+        f"{stored}, with --stored x {ratio:.2f} ({phase:.0f} deg, {peak:.1f} dB, {seconds:.0f} s)"
     )
     return ratio, phase, peak, seconds, line
 

@@ -145,3 +145,17 @@ def trapezoid_of(t_s: Array, demand: Array) -> tuple[float, float]:
         widths = best[1] * (1.0 + NARROWER * (WIDTHS - WIDTHS.mean()))
     ramp_share, duration = best
     return abs(last - first) / (duration * (1.0 - ramp_share)), ramp_share * duration
+
+
+def mirrored(t_s: Array, demand: Array) -> tuple[Array, Array]:
+    """Return times and demands of a move that brakes as it speeds up: its way to the fastest place, there and back.
+
+    Parameters
+    ----------
+    t_s, demand : ndarray
+        As of :func:`trapezoid_of`.
+    """
+    middle = 0.5 * (float(demand[0]) + float(demand[-1]))
+    half = int(np.argmin(np.abs(demand - middle)))
+    t, angle = t_s[: half + 1], demand[: half + 1]
+    return np.append(t, 2.0 * t[-1] - t[-2::-1]), np.append(angle, 2.0 * angle[-1] - angle[-2::-1])

@@ -55,6 +55,9 @@ class PositionDrive(TorqueDrive):
         Rated current, or the drive's own limit or what it can show where that is smaller (A peak).
     compared : ComparedSpeed
         The speed that the drive shows, against that of its position.
+    brakes_alone : bool
+        Whether the drive's deceleration (0x6084) can only be read: it brakes by that, or by 0x6083 where it has one
+        ramp for both. Known once a profile was lent.
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
     """
@@ -81,6 +84,7 @@ class PositionDrive(TorqueDrive):
         self.error_limit_rad = math.inf
         kept = allowed(self.node, current_limits(self.node, self._rated_apk))
         self.current_allowed_apk = min(self._rated_apk, math.inf if kept is None else kept[1], self.shows_apk)
+        self.brakes_alone = False
         self.sends = True
         self._sending: AbstractContextManager[LiveValues] | None = None
         self._taken: list[tuple[float, float, float, float]] = []
@@ -135,6 +139,9 @@ class PositionDrive(TorqueDrive):
                 if self.node.held(item) not in (None, counts):
                     self.node.put(item, counts)
             except SdoAbort as abort:
+                if item == objects.PROFILE_DECELERATION and abort.code == AbortCode.READ_ONLY:
+                    self.brakes_alone = True
+                    continue
                 raise NotAvailable(
                     f"the drive refuses {counts} in 0x{item.index:04X}", where=abort.where,
                     hint="leave --design, --speed and --acceleration out: the drive then moves as it is set up",

@@ -24,6 +24,9 @@ counts the other way took a shaft of 1.6e-4 kg m2 to 2046 rpm and 8 turns at onc
 
 
 UNSEEN = "before the move little current did not turn the shaft: nothing showed that its position counts the right way"
+BRAKES_ALONE = (
+    "the drive's deceleration (0x6084) can only be read: it brakes by that, or by 0x6083 where it has one ramp for both"
+)
 
 
 def record_move(
@@ -66,7 +69,8 @@ def record_move(
             guard.quick_stop()
         finally:
             trace = drive.end_samples()
-    doubts = [*([] if seen else [UNSEEN]), *filter(None, [trace.meta["speed_doubt"]])]
+    alone = [BRAKES_ALONE] if drive.brakes_alone else []
+    doubts = [*([] if seen else [UNSEEN]), *alone, *filter(None, [trace.meta["speed_doubt"]])]
     meta = {**trace.meta, "way_rad": way_rad, "doubts": doubts}
     return Trace(trace.t_s, trace.signals, trace.units, meta), found
 

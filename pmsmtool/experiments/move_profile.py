@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pmsmtool.arrays import Array
-from pmsmtool.axis.reference import trapezoid_of
+from pmsmtool.axis.reference import mirrored, trapezoid_of
 from pmsmtool.drive.guard import GuardedDrive
 from pmsmtool.drive.position_drive import LARGEST, PositionDrive
 from pmsmtool.errors import DriveTimeout, NotAvailable
@@ -148,7 +148,8 @@ class _Trial:
         self.go(0.0)
         end, best = self._way, (0.0, 0.0)
         for _ in range(MOVES):
-            speed, ramp_s = trapezoid_of(*self.go(end))
+            t, demand = self.go(end)
+            speed, ramp_s = trapezoid_of(*(mirrored(t, demand) if self._drive.brakes_alone else (t, demand)))
             end = self._way - end
             wanted_s = aim / self._acceleration
             best = (speed, speed / max(ramp_s, SHORTEST_RAMP_S))

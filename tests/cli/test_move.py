@@ -14,7 +14,7 @@ import pytest
 
 from pmsmtool.arrays import Array
 from pmsmtool.axis.design import PID
-from pmsmtool.axis.reference import trapezoid_of
+from pmsmtool.axis.reference import mirrored, trapezoid_of
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.trace import Trace
@@ -129,10 +129,13 @@ UNITS_WITHIN = 0.05
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize("ramp", ["1", "2000000000"])
-def test_a_profile_of_unknown_unit_is_found_by_the_demand(tool: Tool, tmp_path: Path, ramp: str) -> None:
-    """Stored ramps that take minutes, or none: the move is the one that is asked for, and the counts come back."""
-    profile = ((0x6081, 0, "U32", "rw", "7"), (0x6083, 0, "U32", "rw", ramp), (0x6084, 0, "U32", "rw", ramp))
+@pytest.mark.parametrize(("ramp", "down"), [("1", "rw"), ("2000000000", "ro")])
+def test_a_profile_of_unknown_unit_is_found_by_the_demand(tool: Tool, tmp_path: Path, ramp: str, down: str) -> None:
+    """Stored ramps that take minutes, or none: the move is the one that is asked for, and the counts come back.
+
+    Of a deceleration that can only be read (Trinamic's) the move speeds up as is asked for, and brakes as it will.
+    """
+    profile = ((0x6081, 0, "U32", "rw", "7"), (0x6083, 0, "U32", "rw", ramp), (0x6084, 0, "U32", down, ramp))
     eds = write_eds(tmp_path / "unit.eds", unknown("0x2D", *POSITION, *profile))
     channel = ("--sim", f"interior-2k2?eds={eds}&nv={tmp_path / 'unit.nv'}")
     asked = ("--by", "90deg", "--speed", "120rpm", "--acceleration", "120", "--yes", "--json", "--settle", "0.2s")
@@ -144,7 +147,8 @@ def test_a_profile_of_unknown_unit_is_found_by_the_demand(tool: Tool, tmp_path: 
     assert found["speed_counts"] == pytest.approx(2.0 * 131072, rel=UNITS_WITHIN)  # increments per second
     assert found["ramp_counts"] == pytest.approx(120.0 / (2.0 * math.pi) * 131072, rel=2.0 * UNITS_WITHIN)
     trace = read_trace(Path(answer["run"]) / "traces" / "move.npz")
-    speed, ramp_s = trapezoid_of(*first_move(trace))
+    assert ("0x6084) can only be read" in said) == (down == "ro")
+    speed, ramp_s = trapezoid_of(*mirrored(*first_move(trace)))
     assert speed == pytest.approx(4.0 * math.pi, rel=UNITS_WITHIN)
     assert speed / ramp_s == pytest.approx(120.0, rel=2.0 * UNITS_WITHIN)
     inertia = answer["identified"]["J_kgm2"]
