@@ -42,7 +42,7 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, gain_object
 from pmsmtool.measurement.learn_gains import learn_speed_loop, within_budget
-from pmsmtool.measurement.learn_position_gain import learn_position_gain, position_gain
+from pmsmtool.measurement.learn_position_gain import FORWARD, POSITION, learn_position_gain, position_gain
 from pmsmtool.measurement.learned_rows import emf_of, learned_gains, shown_currents
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.simulated_machine import settings_of
@@ -174,8 +174,10 @@ def _learn(connection: Connection, told: MachineFile, machine: MachineFile, gain
     _judge(result, told, machine, gains, measured, drive)
     held = position_gain(drive.node)
     if held is not None and gains.position == (held.item.index, held.item.sub):
-        one, _ = learn_position_gain(connection, drive.node, held, envelope, lambda text: None)
-        _note(result, "K_v", one, "value", gains.K_v_per_s)
+        found, _ = learn_position_gain(connection, drive.node, held, envelope, lambda text: None)
+        _note(result, "K_v", found[POSITION], "value", gains.K_v_per_s)
+        if FORWARD in found:
+            _note(result, "v_ff", found[FORWARD], "value", gains.forward_share)
 
 
 def _judge(
@@ -230,7 +232,7 @@ def main() -> int:
     counted = Counter((key, verdict) for r in results for key, verdict in r.verdicts.items())
     wrong = sum(n for (_, verdict), n in counted.items() if verdict == "wrong")
     print(f"{len(results)} drives of {len(FAMILIES)} families")
-    for key in ("K_p", "K_i", "K_v", "current"):
+    for key in ("K_p", "K_i", "K_v", "v_ff", "current"):
         right, bad = counted[key, "right"], counted[key, "wrong"]
         known = max(1, right + bad + counted[key, "unknown"])
         sizes = sorted(100 * abs(r.errors[key]) for r in results if key in r.errors)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pmsmtool.axis.loops import AxisGains, AxisPath, best_share, following_error
-from pmsmtool.axis.reference import Profile, jerk_limited, plan
+from pmsmtool.axis.reference import Move, Profile, jerk_limited, plan
 from pmsmtool.axis.search import Box, Case, Judged, Limits, stiffest
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, axis_loop
@@ -146,6 +146,10 @@ class AxisDrive:
         """Whether one controller of the position gives the torque."""
         return PID[0] in self.offers
 
+    def feeds(self, name: str) -> bool:
+        """Whether a feed-forward acts as designed: it is written, or a person enters the whole axis by hand."""
+        return name in self.offers or not self.offers & {CASCADE[0], PID[0]}
+
 
 @dataclass(frozen=True, slots=True)
 class AxisDesign:
@@ -203,7 +207,8 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     J, friction = box.path.shaft.J, design.machine.machine.tau_c_nm or 0.0
     jerk = float(design.facts["axis_jerk_rad_s3"]) if drive.own_core or PROFILE[3] in drive.offers else math.inf
     limits = Profile(float(design.facts["axis_speed_rad_s"]), float(design.facts["axis_acceleration_rad_s2"]), jerk)
-    plain, added = following_error(box.plant, box.path, position, plan(WAY_RAD, limits))
+    move = plan(WAY_RAD, limits)
+    plain, added = following_error(box.plant, box.path, position, move, stored.get(CASCADE[1], 0.0))
     held = stored.get(CASCADE[2], 0.0) / J
     wave = plain - plain.mean() + held * (added - added.mean())
     before = float(np.max(np.abs(wave))) + friction / position.pid[0]
@@ -221,7 +226,7 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
             f"with {phase:.3g} deg and {peak:.3g} dB over the tolerance box: they are not kept"
         )
         return replace(made, design=replace(design, facts={**design.facts, **told}, notes=(*design.notes, note)))
-    share, error = best_share(plain, added)
+    share, error = _best_forward(box, position, move, drive)
     errors = f"{math.degrees(before):.3g} deg of following error, {math.degrees(after):.3g} designed"
     how = f"as the drive holds it: {errors}"
     gains = {name: DesignValue(stored[name], how, design.values[name].loop) for name in _gain_rows(drive)}
@@ -238,6 +243,12 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     note = "the stored gains are kept: the designed ones, with the margins asked for, would follow worse"
     base = replace(design, facts={**design.facts, **told}, notes=(*design.notes, note))
     return AxisDesign(_judged(base, gains, box, speed, position), box, speed, position)
+
+
+def _best_forward(box: Box, gains: AxisGains, move: Move, drive: AxisDrive) -> tuple[float, float]:
+    """Return the share of the inertia to feed forward and the following error (rad), with what acts on this drive."""
+    plain, added = following_error(box.plant, box.path, gains, move, float(drive.feeds(CASCADE[1])))
+    return best_share(plain, added if drive.feeds(CASCADE[2]) else np.zeros_like(added))
 
 
 def _gain_rows(drive: AxisDrive) -> tuple[str, ...]:
@@ -303,7 +314,7 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
     )  # fmt: skip
     jerk = profile if drive.own_core or PROFILE[3] in drive.offers else replace(profile, jerk=math.inf)
     move = plan(WAY_RAD, jerk)
-    share, error = best_share(*following_error(box.plant, path, position, move))
+    share, error = _best_forward(box, position, move, drive)
     predicted: dict[str, Scalar] = {
         "axis_inertia_ff_share": share,
         "axis_following_error_rad": error,

@@ -299,8 +299,12 @@ SHARES = np.linspace(0.0, 1.0, 21)
 """Shares of the inertia that are compared."""
 
 
-def following_error(plant: Lifted, path: AxisPath, gains: AxisGains, move: Move) -> tuple[Array, Array]:
+def following_error(
+    plant: Lifted, path: AxisPath, gains: AxisGains, move: Move, speed_share: float = 1.0
+) -> tuple[Array, Array]:
     """Return the following error (rad) of a move there and back, periodic, shape (n,), by samples of the loops.
+
+    ``speed_share``: of the move's speed, that a cascade feeds forward.
 
     Returns
     -------
@@ -322,7 +326,7 @@ def following_error(plant: Lifted, path: AxisPath, gains: AxisGains, move: Move)
     asked = angle * reference
     if path.structure == "cascade":
         control = slip if path.pll_rad_s else _speed_control(path, gains, z)
-        asked = control * (gains.K_v * reference + fast)
+        asked = control * (gains.K_v * reference + speed_share * fast)
     plain = reference - seen[0] * asked / back
     added = -seen[0] * path.shaft.J * force / back
     return tuple(np.fft.irfft(np.concatenate(([0.0], one)), 2 * half) for one in (plain, added))  # type: ignore[return-value]

@@ -75,7 +75,13 @@ def learn_command(
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, gain_address, gain_object, refuse_unsafe
     from pmsmtool.measurement.learn_gains import learn_speed_loop, learning_envelope
-    from pmsmtool.measurement.learn_position_gain import POSITION, learn_position_gain, position_gain
+    from pmsmtool.measurement.learn_position_gain import (
+        FORWARD,
+        POSITION,
+        forward_object,
+        learn_position_gain,
+        position_gain,
+    )
     from pmsmtool.measurement.learned_rows import emf_of, learned_gains
 
     asked = _addresses(names)
@@ -96,6 +102,8 @@ def learn_command(
             found[name] = gain_object(node, name, *(asked.get(name) or gain_address(node, name)))
         if POSITION in asked and (held := position_gain(node, asked[POSITION])) is not None:
             found[POSITION] = held
+            if (forward := forward_object(node)) is not None:
+                found[FORWARD] = forward
         envelope = learning_envelope(
             drive, file, motion.i_max_apk, motion.speed_max_rad_s, motion.shaft, motion.load, motion.brake
         )
@@ -104,7 +112,7 @@ def learn_command(
             *envelope.lines(),
             *unlike_stated(node),
             "the shaft turns at up to 70 % of the speed limit and takes steps, with the drive's own speed loop",
-            *(["then it moves by three turns and back, twice, with its position loop"] if POSITION in found else []),
+            *(["then its position loop moves it by three turns and back, some times"] if POSITION in found else []),
             *(f"{gain.name} in {gain.address} holds {gain.counts:.9g}: it is changed while the voltage is off, and "
               "restored" for gain in found.values()),
             "nothing is stored in the drive; every changed object is restored",
@@ -113,11 +121,12 @@ def learn_command(
         measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, emf_of(file), out.note)
         results, stopped = learned_gains(file, measured), None
         if POSITION in found:
-            results[POSITION], stopped = learn_position_gain(connection, node, found[POSITION], envelope, out.note)
+            of_moves, stopped = learn_position_gain(connection, node, found[POSITION], envelope, out.note)
+            results |= of_moves
         drive.close()
     for note in measured.notes:
         out.warn(note)
-    told = {name: results[name] for name in asked if name in results}
+    told = {name: results[name] for name in (*asked, FORWARD) if name in results}
     _tell(file, drive, measured, found, told, output, out, stopped)
 
 

@@ -8,7 +8,8 @@ demanded and seen speed apart:
 
     i = a (K_v e + f omega_ref - omega) + b (K_v int e dt + f theta_ref - theta) + c,
 
-so that f is the coefficient of omega_ref over that of -omega. A loop whose lag does not settle (an integral part of the
+so that f is the coefficient of omega_ref over that of -omega. A feed-forward that has an object is 0 for this; what it
+counts then follows from the lag with it over that without. A loop whose lag does not settle (an integral part of the
 position, or one controller of the position) is none of this kind.
 """
 
@@ -80,17 +81,7 @@ def position_lag(trace: Trace, rad_per_count: float) -> PositionLag:
     rad_per_count : float
         Angle of one count of the position (rad).
     """
-    t, demand, position = trace.t_s, trace["theta_ref_rad"], trace["theta_m_rad"]
-    quarters = []
-    for first, last in _even_parts(t, demand):
-        edges = np.searchsorted(t, t[first] + (t[last] - t[first]) * np.array([0.5, 0.75, 1.0]))
-        for a, b in pairwise(edges):
-            speed = float(np.polyfit(t[a:b], demand[a:b], 1)[0])
-            quarters.append((speed, float(np.mean(demand[a:b] - position[a:b]))))
-    if len(quarters) < 4:
-        raise _refused("the demand was even for too short a time", "give the drive its head: no limit below the speed")
-    speeds, lags = np.array(quarters).T
-    lags = lags * np.sign(speeds)
+    speeds, lags = _even_lags(trace)
     lag = float(np.mean(lags))
     if lag < LEAST_COUNTS * rad_per_count:
         least = f"{lag / rad_per_count:.3g} counts, {LEAST_COUNTS:g} needed"
@@ -98,10 +89,39 @@ def position_lag(trace: Trace, rad_per_count: float) -> PositionLag:
     drift = float(np.max(np.abs(lags[1::2] - lags[::2]))) / lag
     if drift > SETTLED:
         raise _refused(f"the lag still changes by {100.0 * drift:.2g} % while the speed is even", "")
-    gain = float(np.mean(np.abs(speeds))) / lag
+    gain = float(np.mean(speeds)) / lag
     spread = float(np.std(lags[::2] + lags[1::2], ddof=1)) / (2.0 * lag)
     forward, forward_std = _fed_forward(trace)
     return PositionLag(gain, math.hypot(spread, drift, LATE_S * gain), forward, forward_std)
+
+
+def _even_lags(trace: Trace) -> tuple[Array, Array]:
+    """Return speed and lag along it of the third and the last quarter of every even part."""
+    t, demand, position = trace.t_s, trace["theta_ref_rad"], trace["theta_m_rad"]
+    quarters = []
+    for first, last in _even_parts(t, demand):
+        edges = np.searchsorted(t, t[first] + (t[last] - t[first]) * np.array([0.5, 0.75, 1.0]))
+        for a, b in pairwise(edges):
+            speed = float(np.polyfit(t[a:b], demand[a:b], 1)[0])
+            quarters.append((abs(speed), math.copysign(1.0, speed) * float(np.mean(demand[a:b] - position[a:b]))))
+    if len(quarters) < 4:
+        raise _refused("the demand was even for too short a time", "give the drive its head: no limit below the speed")
+    return np.array(quarters).T[0], np.array(quarters).T[1]
+
+
+def fed_share(trace: Trace, without: PositionLag) -> tuple[float, float]:
+    """Return the share of the demanded speed that is fed forward in moves, and its standard deviation.
+
+    ``without``: what moves with the same position gain and no feed-forward showed. Raises IdentificationError: as
+    :func:`position_lag`.
+    """
+    speeds, lags = _even_lags(trace)
+    times = lags / speeds
+    drift = float(np.max(np.abs(times[1::2] - times[::2])))
+    share = 1.0 - without.gain_per_s * float(np.mean(times))
+    spread = float(np.std(times[::2] + times[1::2], ddof=1)) / 2.0
+    own = without.gain_per_s * math.hypot(spread, drift)
+    return share, math.hypot(own, (1.0 - share) * without.std, LATE_S * without.gain_per_s)
 
 
 def _even_parts(t: Array, demand: Array) -> Iterator[tuple[int, int]]:
@@ -168,6 +188,15 @@ def position_scale(
         fed = f"{100.0 * forward:.0f} +-{100.0 * NORMAL_95 * forward_std:.0f} % of the speed fed forward"
         return unknown(f"its interval of {100.0 * half:.0f} % is too wide, with {fed}", half)
     return Learned(name, per_count, half, "value", UNIT)
+
+
+def forward_scale(counts: float, share: float, std: float, name: str) -> Learned:
+    """Return what one count of the feed-forward of the speed is worth (1), from the share that some counts feed."""
+    half = NORMAL_95 * std / abs(share) if share else math.inf
+    if not share > 0.0 or half > WIDEST:
+        fed = f"{counts:.9g} counts feed {100.0 * share:.0f} +-{100.0 * NORMAL_95 * std:.0f} % of the speed forward"
+        return Learned(name, None, half, None, "", fed)
+    return Learned(name, share / counts, half, "value", "1")
 
 
 def _refused(what: str, likely: str) -> IdentificationError:

@@ -80,7 +80,7 @@ def named_addresses(node: DriveNode, name: str) -> list[tuple[int, int]]:
     return [(int(index, 16), int(sub, 16)) for index, sub in places]
 
 
-def gain_object(node: DriveNode, name: str, index: int, sub: int) -> GainObject:
+def gain_object(node: DriveNode, name: str, index: int, sub: int, *, may_be_zero: bool = False) -> GainObject:
     """Return the object of a gain, its type by the map, else by its size.
 
     Raises NotAvailable: the drive has no such object, or its type is not known, or it is too small to be changed by a
@@ -109,7 +109,8 @@ def gain_object(node: DriveNode, name: str, index: int, sub: int) -> GainObject:
             hint="give the object with its type in a map: --map FILE",
         )  # fmt: skip
     found = GainObject(name, item, held)
-    changed_counts(found, DOWN)
+    if not may_be_zero:
+        changed_counts(found, DOWN)
     return found
 
 

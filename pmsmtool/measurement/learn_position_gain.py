@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: MIT
 """``map learn``, its second part: moves at even speed with the drive's own position gain, and with 0.7 of it.
 
-The only change of the gain is a step down. The feed-forward of the speed is 0 meanwhile, where it has an object.
+The only change of the gain is a step down. The feed-forward of the speed is 0 meanwhile, where it has an object; it is
+learned last, with the drive's own counts, or with as many as are seen, from one upwards.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.errors import IdentificationError, LimitExceeded, NotAvailable, SafetyRefusal
 from pmsmtool.experiments.move import record_move
 from pmsmtool.identification.learned_gains import Learned
-from pmsmtool.identification.position_lag import PositionLag, position_lag, position_scale
+from pmsmtool.identification.position_lag import PositionLag, fed_share, forward_scale, position_lag, position_scale
 from pmsmtool.measurement.changed_gains import (
     DOWN,
+    FLOATS_FROM,
     GainObject,
     changed_counts,
     changing,
@@ -39,6 +41,9 @@ TRAVEL = 1.3
 """Largest travel, of the way."""
 BEHIND = 0.5
 """Largest lag of a shaft that does not follow, of the way."""
+SEEN, AIM, GROWTH = 0.3, 0.8, 8.0
+"""Share of the speed from which a feed-forward is clearly seen, the one aimed at until then, and by how much its counts
+grow at most."""
 
 
 def position_gain(node: DriveNode, address: tuple[int, int] | None = None) -> GainObject | None:
@@ -51,38 +56,53 @@ def _place(node: DriveNode, name: str) -> tuple[int, int] | None:
     return next((address for address in named_addresses(node, name) if node.has(*address)), None)
 
 
+def forward_object(node: DriveNode) -> GainObject | None:
+    """Return the object of the speed's feed-forward, whatever it holds; None without one of whole numbers."""
+    where = node.map.address(FORWARD) if FORWARD in node.map.cells else _place(node, FORWARD)
+    try:
+        return None if where is None else gain_object(node, FORWARD, *where, may_be_zero=True)
+    except NotAvailable:
+        return None
+
+
 def learn_position_gain(
     connection: Connection, node: DriveNode, gain: GainObject, envelope: Envelope, say: Callable[[str], None]
-) -> tuple[Learned, LimitExceeded | None]:
+) -> tuple[dict[str, Learned], LimitExceeded | None]:
     """Return what one count of the position gain is worth, or why that stays unknown; the drive is as before.
 
-    What was learned of other gains stays where this is refused: that is the reason then. A limit of the motion that
-    stopped the shaft is returned beside it, for the caller to raise.
+    Beside it what one count of the speed's feed-forward is worth, where that has an object. What was learned of other
+    gains stays where this is refused: that is the reason then. A limit of the motion that stopped the shaft is returned
+    beside it, for the caller to raise.
 
     Raises DriveTimeout, DriveFault: the drive no longer does as it is told: the voltage is off and the gains are back.
     """
+    found: dict[str, Learned] = {}
     try:
         drive = PositionDrive(connection, node.node, drive_map=node.map)
         try:
-            return _moved(drive, gain, envelope, say), None
+            _moved(drive, gain, envelope, say, found)
         finally:
             drive.close()
     except (IdentificationError, NotAvailable, SafetyRefusal) as error:
         likely = f" (likely: {error.likely})" if error.likely else ""
-        unknown = Learned(POSITION, None, math.inf, None, "", error.what.partition("\n")[0] + likely)
-        return unknown, error if isinstance(error, LimitExceeded) else None
+        name = FORWARD if POSITION in found else POSITION
+        found[name] = Learned(name, None, math.inf, None, "", error.what.partition("\n")[0] + likely)
+        return found, error if isinstance(error, LimitExceeded) else None
+    return found, None
 
 
-def _moved(drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Callable[[str], None]) -> Learned:
-    """Move with the gain as it is and with less of it."""
+def _moved(
+    drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Callable[[str], None], found: dict[str, Learned]
+) -> None:
+    """Move with the gain as it is and with less of it, then with the speed fed forward; note what is found."""
     node = drive.node
     refuse_unsafe(node, envelope)
-    forward, forward_is_zero = _fed_forward(node)
+    forward = forward_object(node)
     written = [gain] if forward is None else [gain, forward]
     drive.error_limit_rad = BEHIND * WAY_RAD
     lags: list[tuple[float, PositionLag]] = []
     with changing(drive, written, replace(envelope, travel_rad=TRAVEL * WAY_RAD), say) as (guard, put):
-        if forward is not None:
+        if forward is not None and forward.counts:
             put(forward, 0.0)
         record_move(guard, drive, SHORT_RAD, REST_S, find=(SPEED_RAD_S, SPEED_RAD_S / RAMP_S))
         for counts in (gain.counts, changed_counts(gain, DOWN)):
@@ -91,19 +111,25 @@ def _moved(drive: PositionDrive, gain: GainObject, envelope: Envelope, say: Call
             trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
             lags.append((counts, position_lag(trace, drive.rad_per_count)))
             say(f"{gain.address} = {counts:.9g}: speed over lag {lags[-1][1].gain_per_s:.4g} 1/s")
+        put(gain, gain.counts)
+        told = position_scale(lags[0], lags[1], POSITION, forward_is_zero=forward is not None)
+        found[POSITION] = told
+        if forward is not None and told.scale is not None:
+            counts = forward.counts or 1.0
+            while True:
+                put(forward, counts)
+                trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
+                share, std = fed_share(trace, lags[0][1])
+                say(f"{forward.address} = {counts:.9g}: {100.0 * share:.3g} % of the speed fed forward")
+                more = round(counts * min(GROWTH, AIM / max(share, AIM / GROWTH)))
+                if share > SEEN or more > _most(forward):
+                    break
+                counts = more
+            found[FORWARD] = forward_scale(counts, share, std, FORWARD)
         for item in written:
             put(item, item.counts)
-    return position_scale(lags[0], lags[1], POSITION, forward_is_zero=forward_is_zero)
 
 
-def _fed_forward(node: DriveNode) -> tuple[GainObject | None, bool]:
-    """Return what must be set to 0 so that no speed is fed forward, and whether none is then."""
-    where = node.map.address(FORWARD) if FORWARD in node.map.cells else _place(node, FORWARD)
-    if where is None:
-        return None, False
-    if not any(node.sdo.read(*where)):
-        return None, True
-    try:
-        return gain_object(node, FORWARD, *where), True
-    except NotAvailable:  # no whole number
-        return None, False
+def _most(gain: GainObject) -> float:
+    """Return the largest counts that an object is tried with: it may have a sign, or four bytes may be a REAL32."""
+    return FLOATS_FROM if gain.item.size == 4 else (1 << 8 * gain.item.size - 1) - 1

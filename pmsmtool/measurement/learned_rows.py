@@ -65,11 +65,13 @@ def shown_currents(file: MachineFile, measured: LearnedLoop, drive: SpeedLoopDri
 
 
 def measured_row(gain: GainObject, found: Learned) -> MeasuredRow:
-    """Return the row of a map; the scale must be decided."""
+    """Return the row of a map; the scale must be decided. A whole number may have a sign: half of its room is used."""
     assert found.scale is not None and found.form is not None
     other = GAIN if found.form in ("rate", "time") else ""
+    letter = gain.item.letter
+    signed = letter.lower() if gain.counts < 1 << 8 * gain.item.size - 1 else letter
     return MeasuredRow(
-        gain.name, gain.item.index, gain.item.sub, _WIRES[gain.item.letter], found.form, other, found.scale,
+        gain.name, gain.item.index, gain.item.sub, _WIRES[signed], found.form, other, found.scale,
         found.unit, found.half_width,
     )  # fmt: skip
 

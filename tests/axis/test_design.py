@@ -179,10 +179,12 @@ def test_gains_that_follow_better_are_kept() -> None:
     source, own = machine(), load_family("pmsmsim")
     sharp = design_axis(source, TuneRequest(), AxisRequest(phase_margin_deg=25.0, peak_db=10.0), own)
     names = ("speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad", "position.K_p_per_s")
-    stored = {name: sharp[name] for name in names} | {"position.inertia_ff_kgm2": sharp["position.inertia_ff_kgm2"]}
+    stored = {name: sharp[name] for name in (*names, "position.velocity_ff", "position.inertia_ff_kgm2")}
     made = design_axis(source, TuneRequest(), ASKED, own, stored)
     assert all(made[name] == stored[name] for name in names)
     assert made.facts["axis_error_rad"] <= made.facts["axis_stored_error_rad"] * (1.0 + 1e-9)
+    slow = design_axis(source, TuneRequest(), ASKED, own, {**stored, "position.velocity_ff": 0.0})
+    assert slow.facts["axis_stored_error_rad"] > 0.5 > made.facts["axis_stored_error_rad"], "the lag is speed over K_v"
     assert made.facts["axis_position_S_peak_db"] > 6.0, "and the design says what margins they have"
     assert any("are kept" in note for note in made.notes)
     calm = {**stored, names[0]: 0.1 * stored[names[0]], names[1]: 0.01 * stored[names[1]], names[2]: 5.0}
@@ -190,7 +192,7 @@ def test_gains_that_follow_better_are_kept() -> None:
     unstable = design_axis(source, TuneRequest(), ASKED, own, wild)  # what it writes can be read: it held an infinity
     assert parse_design(design_text(unstable)).facts == unstable.facts
     assert "axis_stored_error_rad" not in unstable.facts and any("unstable" in note for note in unstable.notes)
-    edge = {name: stored[name] * 1.4**power for name, power in zip(names, (1, 2, 1), strict=True)}
+    edge = stored | {name: stored[name] * 1.4**power for name, power in zip(names, (1, 2, 1), strict=True)}
     plain = designed("pmsmsim", 0.0, 0.0)
     for other in (calm, wild, edge):
         assert [design_axis(source, TuneRequest(), ASKED, own, other)[name] for name in names] == [

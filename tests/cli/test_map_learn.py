@@ -113,6 +113,7 @@ def test_learned_gains_are_the_drawn_ones_and_go_into_a_map(bench: Bench, tool: 
     cells = parse_drive_map((tmp_path / "mine.toml").read_text(encoding="utf-8")).cells
     assert cells[GAIN].source == "measured" and (cells[GAIN].index, cells[GAIN].sub) == drawn.gain
     assert INTEGRAL in cells
+    assert cells[GAIN].wire == "INTEGER16", "its two bytes may have a sign: 35000 counts were refused by the drive"
 
 
 POSITION_ROWS: tuple[Row, ...] = (
@@ -144,8 +145,10 @@ def test_a_learned_position_gain_is_the_drawn_one(tool: Tool, tmp_path: Path, mo
         envelope = Envelope(i_max_apk=8.0, speed_max_rad_s=60.0, duration_s=60.0)
         found, stopped = learn_position_gain.learn_position_gain(connection, node, gain, envelope, lambda text: None)
         assert [node.sdo.read(*place) for place in places.values()] == before and not any_left()
-    assert stopped is None and found.why == "" and found.scale == pytest.approx(drawn.K_v_per_s, rel=SCALE_TOL)
-    assert written == [bytes(2), before[1]]
+    assert stopped is None and [one.why for one in found.values()] == ["", ""]
+    for name, scale in (("position.K_p_per_s", drawn.K_v_per_s), ("position.velocity_ff", drawn.forward_share)):
+        assert found[name].scale == pytest.approx(scale, rel=SCALE_TOL)
+    assert written == [bytes(2), before[1], before[1]], "0, then its own counts to be learned, then restored"
     bench.holder.close()
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import IdentificationError
-from pmsmtool.identification.position_lag import PositionLag, position_lag, position_scale
+from pmsmtool.identification.position_lag import PositionLag, fed_share, forward_scale, position_lag, position_scale
 from pmsmtool.trace import Trace
 
-NAME = "position.K_p_per_s"
+NAME, FORWARD = "position.K_p_per_s", "position.velocity_ff"
 T_S, J, COUNT = 1e-3, 2e-4, 2.0 * math.pi / 4096.0
 K_TORQUE = 0.4
 SPEED, RAMP_S, EVEN_S, REST_S = 2.0 * math.pi, 0.25, 2.0, 1.0
@@ -70,6 +70,22 @@ def test_what_is_fed_forward_is_seen_and_keeps_the_gain_unknown(forward: float) 
     assert all(lag.forward == pytest.approx(forward, abs=FORWARD_TOL) for _, lag in lags)
     told = position_scale(lags[0], lags[1], NAME)
     assert told.scale is None and "fed forward" in told.why
+
+
+FED_TOL = 2e-3
+"""Largest error of the share that a feed-forward's counts feed (1); measured 2e-4."""
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_counts_of_a_feed_forward_are_told_by_the_lag_that_they_leave(share: float) -> None:
+    """It was set to 0, and stayed without a unit: `tune --axis` could not write it."""
+    found, std = fed_share(moves(15.0, share), position_lag(moves(15.0), COUNT))
+    assert found == pytest.approx(share, abs=FED_TOL) and std < 0.02
+    told = forward_scale(500.0, found, std, FORWARD)
+    assert told.scale == pytest.approx(share / 500.0, rel=2.0 * FED_TOL) and told.unit == "1"
+    for seen in (0.0, 0.1):
+        unsure = forward_scale(8.0, seen, 0.02, FORWARD)
+        assert unsure.scale is None and "8 counts feed" in unsure.why
 
 
 def test_an_integral_part_of_the_position_is_refused() -> None:

@@ -122,9 +122,10 @@ class DrawnGains:
 
         def taking(position: int) -> Callable[[Behind, float], None]:
             def act(behind: Behind, counts: float) -> None:
-                held[position] = counts
-                K_p, K_i = self.K_p_nms_per_rad * held[0], self.K_i_nm_per_rad(*held)
-                behind.set_speed_gains(K_p, K_i)
+                new = [*held[:position], counts, *held[position + 1 :]]
+                K_p, K_i = self.K_p_nms_per_rad * new[0], self.K_i_nm_per_rad(*new)
+                behind.set_speed_gains(K_p, K_i)  # refuses what it cannot take
+                held[:] = new
                 behind.position_gains.K_p, behind.position_gains.K_i = K_p, K_i
 
             return act
