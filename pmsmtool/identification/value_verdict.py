@@ -193,6 +193,8 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     if evaluation.mismatch is not None and evaluation.mismatch.corrected:
         pairs = zip("abc", evaluation.mismatch.gains, strict=True)
         conditions |= {f"sensor_gain_{phase}_over_mean": 1.0 + gain for phase, gain in pairs}
+    if evaluation.inductance is not None and (bend_per_a := evaluation.inductance.axes["d"].bend_per_a):
+        conditions["L_d_bend_per_a"] = bend_per_a
     for axis, fit in () if evaluation.inductance is None else evaluation.inductance.axes.items():
         if "eddy" in fit.effects:
             conditions |= {f"eddy_{axis}_s": fit.eddy_s, f"eddy_{axis}_time_s": fit.eddy_tau_s}

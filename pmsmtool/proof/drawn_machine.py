@@ -53,6 +53,8 @@ OFFSET_SHARE = 0.001
 MISMATCH = 0.002
 """Standard deviations of sensor offsets (of I_max) about what they show before the proof, and of the phases' gains
 against each other."""
+LEAST_BENT = 0.3
+"""Least L_d that its slope may leave, of that at the bias: the slope of a small ripple holds for no such change."""
 SEEN_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
 """Range of identified eddy currents, drag, cogging, encoder errors and ripple of the link, and factor either way of the
 currents' time constant: one branch stands for many, one order for the orders of the cogging."""
@@ -92,6 +94,7 @@ def draw_machine(
     R = varied.get("R_s_ohm", 1.0)
     out.R_copper, out.R_fixed = R * out.R_copper, R * out.R_fixed
     out.L_d, out.L_q = (getattr(out, n) * varied.get(f"{n}_h", 1.0) for n in ("L_d", "L_q"))
+    _draw_saturation(setup, machine, rng)
     out.psi_f *= varied.get("psi_f_wb", 1.0)
     out.J *= varied.get("J_kgm2", 1.0)
     _draw_elastic_shaft(setup, machine, rng)
@@ -112,6 +115,21 @@ def draw_machine(
     setup.sensors.encoder_latency = age_s
     setup.seed = int(rng.integers(2**62))
     return setup
+
+
+def _draw_saturation(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
+    """Draw the inductances at currents of the steps, where L_d bends with its current and no flux map says how.
+
+    L_d within half of the rated current either way, by its slope at the bias. How much of that the bias took off L_q is
+    not known, up to the same share, nor what the steps of i_q take off: half of it.
+    """
+    bend_per_a, L_d = machine.conditions.get("L_d_bend_per_a"), machine.estimates.get("L_d_h")
+    if not isinstance(bend_per_a, float) or L_d is None or machine.flux_map is not None:
+        return
+    out, bias_a = setup.machine, L_d.i_d_apk
+    within_a = 0.5 * (machine.machine.I_nom_apk or 2.0 * bias_a)
+    out.L_d *= max(LEAST_BENT, 1.0 + bend_per_a * (float(rng.uniform(-within_a, within_a)) - bias_a))
+    out.L_q *= 1.0 + abs(bend_per_a) * bias_a * float(rng.uniform(-0.5, 1.0))
 
 
 def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
