@@ -160,6 +160,12 @@ class _Measured:
     T_known: bool
     i_d_apk: float
     i_q_apk: float
+    bend_per_a: float = 0.0
+
+    @property
+    def at_zero(self) -> float:
+        """The value without its bias, by its slope there: a data sheet may mean either where a machine saturates."""
+        return self.value * (1.0 - self.bend_per_a * self.i_d_apk) if self.bend_per_a else self.value
 
 
 def compare(
@@ -249,7 +255,8 @@ def _measured(values: Sequence[Mapping[str, Any]]) -> dict[str, _Measured]:
         number = float(value["value"])
         half = VENDOR_SHARE * abs(number) if vendor else float(value.get("total_95") or 0.0)
         bias = (math.nan if value.get(key) is None else float(value[key]) for key in ("i_d_apk", "i_q_apk"))
-        found[str(value["name"])] = _Measured(number, half, value.get("T_c") is not None, *bias)
+        at = _Measured(number, half, value.get("T_c") is not None, *bias)
+        found[str(value["name"])] = replace(at, bend_per_a=float(value.get("bend_per_a") or 0.0))
     warm = found.get("R_s_ohm")
     if warm is not None and not warm.T_known and R_MEASURED in found:
         # what is allowed covers the temperatures already: they do not count twice
@@ -298,8 +305,9 @@ def _judged(row: Row, file: MachineFile, found: Mapping[str, _Measured], *, used
         high, text = math.inf, f"{text}, any load above it"
     row = replace(row, low=low, high=high, tolerance=text)
     if measured is not None:
-        least = measured.value - measured.half
-        good = measured.value + measured.half >= low and least <= high
+        least, most = min(measured.value, measured.at_zero), max(measured.value, measured.at_zero)
+        least, most = least - measured.half, most + measured.half
+        good = most >= low and least <= high
         if good and row.name == "R_s_ohm" and least * (1.0 - DEVICE_SHARE) > high - _devices_least_ohm(file):
             # another motor's sheet may look the same
             return replace(row, verdict="NOT CHECKED", tolerance=f"{text}; to check it, measure the winding alone")

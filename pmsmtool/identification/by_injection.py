@@ -71,11 +71,13 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     fallen = [f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback]
     accuracy = accuracy_facts(request.accuracy, request.quantities, found)
     missed = not all(fact["reached"] for fact in accuracy.values())
+    bend_per_a = conditions.get("L_d_bend_per_a")
     facts = [
         {
             **value_verdict.value_facts(name, estimate),
             "accepted": name not in rejected,
             **({"accuracy": accuracy[name]} if name in accuracy else {}),
+            **({"bend_per_a": bend_per_a} if name == "L_d_h" and bend_per_a else {}),
         }
         for name, estimate in (found | timing | kept.ripples()).items()
     ]

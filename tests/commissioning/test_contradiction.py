@@ -115,6 +115,16 @@ def test_the_limit_is_the_joint_interval(name: str, share: float, sign: float) -
         assert wrong(compare(meter, {}, measured(R_s_ohm=1.3 * R))) == contradicted
 
 
+def test_an_inductance_without_its_bias_may_be_what_the_sheet_states() -> None:
+    """L_d of a sheet 28 % too high, of a machine that loses 13 % to the bias: half of that agrees by the slope."""
+    L_d = TRUTH.machine.L_d_h
+    facts = [row | {"i_d_apk": 5.0} for row in measured(L_d_h=0.87 * L_d)]
+    assert wrong(compare(stated(L_d_h=1.28), {}, facts)) == ["L_d_h"]
+    bent = [row | {"bend_per_a": -0.02} if row["name"] == "L_d_h" else row for row in facts]
+    assert not wrong(compare(stated(L_d_h=1.28), {}, bent))
+    assert wrong(compare(stated(L_d_h=1.6), {}, bent)) == ["L_d_h"]
+
+
 def test_its_own_deviations_outrank_the_catalogue() -> None:
     psi = TRUTH.machine.psi_f_wb
     tight = replace(TRUTH, std={"psi_f_wb": 0.01 * psi}, systematic={"psi_f_wb": 0.01 * psi})
