@@ -4,6 +4,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from pmsmtool.estimators.injection.inductance import (
     FrameAhead,
     InductanceResult,
     _bias,
+    _resistance_std,
     bare_shot,
     estimate_inductances,
 )
@@ -550,6 +552,19 @@ def test_eddy_currents_that_replace_the_resistance_stand_for_something_else(
     monkeypatch.setattr(axis_fit, "LEAST_R", 1.5)  # more than the fit finds, 1.0
     found = axis_fit.fit_axis(shots, plain.drives.sigma_dq[1], plain.drives.R[1], torque=False)
     assert "eddy" not in found.effects and found.effects
+
+
+def test_a_resistance_that_no_loop_has_is_a_branch_that_the_model_lacks(plain: Shots) -> None:
+    """Iron losses of 3 and 7 % left L_q -5.5 % at +-2.3 % by a model with 3.6 of the loop's R."""
+    eddy, none = axis_fit.Effects(eddy=True), axis_fit.Effects()
+    fits = {R: SimpleNamespace(x=(0.0, R), cost=1000.0, dof=1000.0) for R in (1.57, 3.65)}
+    rows = [(eddy, fits[1.57], None, None), (none, fits[3.65], None, None)]
+    assert 1.57 < axis_fit.most_resistance(rows) < 3.65  # type: ignore[arg-type]
+    assert axis_fit.most_resistance(rows[1:]) == math.inf  # type: ignore[arg-type]
+    shot = bare_shot(plain.trace(1, "d", 6), "d")
+    half_s = 3.0 * shot.period_s
+    for R_ohm, left in ((1.2, 0.0), (1.57, 0.32 * half_s)):
+        assert _resistance_std(SimpleNamespace(R_ohm=R_ohm), shot, 1.0) == pytest.approx(left)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("flux", "tau", "shown"), [(0.3, 0.0, None), (0.08, 1.5, None), (0.06, 0.0, -0.107)])

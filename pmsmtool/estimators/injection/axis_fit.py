@@ -55,8 +55,8 @@ LEAST_R = 0.8
 """Resistance beside eddy currents, of the loop's, below which they stand for something else: with 0.2 to 0.7 of it, and
 time constants of 13 periods, the ripple of a link put L 13 to 40 % off."""
 MOST_R = 1.25
-"""Resistance, of the loop's, above which a model without eddy currents stands for them where one with them fits: with
-1.4 to 2.6 of it, and an L that falls with the frequency, branches of 3 to 6 % put L 2.6 to 5.5 % off."""
+"""Resistance, of the loop's or of a model with eddy currents that fits, above which a model without them stands for
+them: with 1.4 to 3.6 of it, and an L that falls with the frequency, branches of 3 to 7 % put L 2.6 to 5.5 % off."""
 UNPHYSICAL = 1e9
 """Residual outside the region where the model is defined."""
 
@@ -312,6 +312,12 @@ def _timing(tried: dict[Effects, tuple[Fit, Layout]]) -> Timing:
     )
 
 
+def most_resistance(rows: Sequence[tuple[Effects, Fit, Layout, Array]]) -> float:
+    """Return the resistance, of the loop's, of a model without eddy currents from which on it stands for them."""
+    fitting = [float(fit.x[1]) for effects, fit, *_ in rows if effects.eddy and fit.cost < CHI2_WARN * fit.dof]
+    return MOST_R * max(1.0, min(fitting)) if fitting else math.inf
+
+
 def _average(
     shots: Sequence[Shot],
     slow: Sequence[NDArray[np.float64]],
@@ -326,8 +332,8 @@ def _average(
     firsts = [(row, row[2].responses(row[1].x)[0]) for row in rows]
     rows = [row for row, at in firsts if at.model.eddy_s >= 0.0 and (row[2].motion is not None or at.motion >= 0.0)]
     rows = [row for row in rows if not row[0].eddy or row[1].x[1] > LEAST_R]
-    if any(e.eddy and fit.x[1] < MOST_R and fit.cost < CHI2_WARN * fit.dof for e, fit, *_ in rows):
-        rows = [row for row in rows if row[0].eddy or row[1].x[1] < MOST_R]
+    most_R = most_resistance(rows)
+    rows = [row for row in rows if row[0].eddy or row[1].x[1] < most_R]
     if not rows:
         raise refuse("E_NOT_CONVERGED", "no model of the axis could be fitted", stage="inductance")
     weights = information_weights([_criterion(fit, layout, timing) for _, fit, layout, _ in rows])
