@@ -19,7 +19,7 @@ from pmsmtool.estimators.encoder import (
     estimate_by_rests,
     estimate_encoder,
 )
-from pmsmtool.estimators.estimate import SensorTolerance, Verdict, total_half_width
+from pmsmtool.estimators.estimate import CHI2_WARN, SensorTolerance, total_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult, check_magnet, estimate_flux_linkage, magnet_change
 from pmsmtool.estimators.flux.map_result import FluxMapResult
 from pmsmtool.estimators.injection.axis_layout import Motion
@@ -187,13 +187,13 @@ def wrapped(angle: float) -> float:
 
 
 def _beside_speeds(inductance: InductanceResult, apparent: Estimate) -> InductanceResult:
-    """Return L_q with what the run over speeds says otherwise in its interval, where the model misses the shots, too.
+    """Return L_q with what the run over speeds says otherwise in its interval, where the model misses its shots, too.
 
     A phase current within the inverter's knee made L_q four times too large at +-13 %.
     """
     L_q = inductance.L_q
     check = cross_check("L_q_h_apparent", "L_q_h", apparent, L_q)
-    if check.agrees or inductance.verdict is not Verdict.WARN:
+    if check.agrees or not (L_q.chi2 > CHI2_WARN or "q" in inductance.frequency_dependent):
         return inductance
     told = f"the model misses the shots, and the run over speeds shows {format_quantity(apparent.value, 'H')}"
     fallback = "; ".join(filter(None, (L_q.fallback, told)))
