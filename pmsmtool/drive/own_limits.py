@@ -121,8 +121,19 @@ def put_limit(node: DriveNode, limit: Quantity | None, wanted: float, most: floa
     return counts * limit.per_count
 
 
+def refuse_no_current(node: DriveNode, i_max: float) -> None:
+    """Refuse to begin where the drive allows no current."""
+    if not i_max > 0.0:
+        raise SafetyRefusal(
+            "the drive allows no current: its rated current or one of its limits (0x6073, 0x6072) is 0",
+            where=f"node {node.node}", likely="the drive is as it left its factory: the motor is not set up",
+            hint="run the maker's own set-up first",
+        )  # fmt: skip
+
+
 def _refuse_no_limit(node: DriveNode, rated: float, i_max: float) -> None:
     """Refuse a current limit so far above the drive's rated current that it limits nothing."""
+    refuse_no_current(node, i_max)
     largest = RATED_RATIO * rated
     if not i_max <= largest:  # what is no number is no limit either
         raise SafetyRefusal(

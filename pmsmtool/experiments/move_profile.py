@@ -154,6 +154,8 @@ class _Trial:
             wanted_s = aim / self._acceleration
             best = (speed, speed / max(ramp_s, SHORTEST_RAMP_S))
             slower = max(ramp_s, SHORTEST_RAMP_S) / (wanted_s * speed / aim)
+            if ramp_s < 0.5 * SEEN_RAMP_S and slower < 1.0:  # hardly seen: it may be shorter by any factor
+                slower = min(slower, 1.0 / GROWTH)
             before = (self.speed, self.ramp)
             if abs(speed / aim - 1.0) > SPEED_WITHIN:
                 self.speed *= aim / speed

@@ -20,9 +20,10 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive, guarded
 from pmsmtool.drive.motion_objects import allowed, current_limits, rated_apk, speed_limits, trips_itself
+from pmsmtool.drive.own_limits import refuse_no_current
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
 from pmsmtool.drive.torque_drives import SpeedPushDrive, TorqueDrive, pushing_drive
-from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.experiments.current_limit import LimitShown, require_limit, show_torque_limit, unproven
 from pmsmtool.experiments.polled_push import (
@@ -227,12 +228,7 @@ def envelope_of(drive: CanopenDrive, request: IdentifyRequest, known: MachineFil
             f"the drive's largest speed (0x6080) is {rpm:.0f} rpm: that is no limit", hint="give --speed-max"
         )
     i_max = HEADROOM * rated if request.i_max_apk is None else request.i_max_apk
-    if not i_max > 0.0:
-        raise SafetyRefusal(
-            "the drive allows no current: its rated current or one of its limits (0x6073, 0x6072) is 0",
-            where=f"node {node.node}", likely="the drive is as it left its factory: the motor is not set up",
-            hint="run the maker's own set-up first",
-        )  # fmt: skip
+    refuse_no_current(node, i_max)
     return Envelope(
         i_max_apk=i_max,
         speed_max_rad_s=rpm * RAD_S_PER_RPM if request.speed_max_rad_s is None else request.speed_max_rad_s,

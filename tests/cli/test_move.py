@@ -225,6 +225,15 @@ def test_a_drive_without_position_mode_is_named(tool: Tool, tmp_path: Path) -> N
     assert code == 9 and "profile position mode" in said and "0x6062" in said
 
 
+def test_a_drive_that_allows_no_current_is_named(
+    tool: Tool, drive: Sequence[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nine of 120 makers' files hold a limit of 0: 0.0028 A were "outside the limit 0 A", with the voltage on."""
+    monkeypatch.setattr("pmsmtool.drive.position_drive.allowed", lambda node, limits: (None, 0.0))
+    code, _, said = tool("move", *ASKED, *drive)
+    assert code == 5 and "allows no current" in said and "supervision tested" not in said
+
+
 def test_a_move_of_no_way_is_refused(tool: Tool, drive: Sequence[str]) -> None:
     assert tool("move", "--by", "0deg", *drive, "--yes")[0] == 2
 
