@@ -480,14 +480,15 @@ def test_means_of_halves_are_doubted_by_their_scatter_and_the_torques_scale(monk
                      i_d_a=0.0 * t, i_q_a=0.5 + 0.0 * t) for k in range(4)]  # fmt: skip
     for nothing in (0.0, -1e-3):
         monkeypatch.setattr(
-            mechanics, "_mean_motion", lambda blocks, power=0.0, J=nothing: (np.array([J, -1e-3, 0.05]), [0.0] * 3, [])
+            mechanics, "_mean_motion", lambda blocks, power=0.0, J=nothing: (np.array([J, 1e-3, 0.05]), np.eye(3), [])
         )
         assert mechanics.mean_mechanics(traces, lambda d, q: q, 0.03, 1) == {}
         with pytest.raises(IdentificationError, match="J = "):
             mechanics._start([])
     for stds, kept in (([1e-5, 1e-3, 0.02], 3), ([1e-5, 0.1, 0.02], 1), ([1e-5, 1e-3, 0.3], 1)):
+        covariance = np.diag(np.square(stds))
         monkeypatch.setattr(
-            mechanics, "_mean_motion", lambda blocks, power, stds=stds: (np.array([2e-3, -1e-3, 0.05]), stds, [])
+            mechanics, "_mean_motion", lambda blocks, power, found=covariance: (np.array([2e-3, 1e-3, 0.05]), found, [])
         )
         found = mechanics.mean_mechanics(
             traces, lambda d, q: q, 0.03, 1, SensorTolerance(current_gain=0.03, voltage_gain=0.04)

@@ -190,7 +190,8 @@ def test_mean_motions_are_a_weighted_regression_of_mean_torques(power: float) ->
     weighted = matrix * weight[:, None]
     x, rest, *_ = np.linalg.lstsq(weighted, target * weight, rcond=None)
     std = np.sqrt(np.diag(np.linalg.inv(weighted.T @ weighted)) * rest[0] / (len(target) - 3))
-    found, deviations, begun = mechanics._mean_motion(runs, power)
+    found, covariance, begun = mechanics._mean_motion(runs, power)
+    deviations = np.sqrt(np.diag(covariance))
     assert found == pytest.approx(x, rel=1e-6) and deviations == pytest.approx(std, rel=1e-5)
     assert begun == pytest.approx(states, rel=1e-6, abs=1e-9)
 

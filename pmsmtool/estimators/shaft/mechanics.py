@@ -18,6 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
@@ -272,14 +273,18 @@ def mean_mechanics(
     """Return inertia and friction by their keys, from a regression of the mean torques on the mean motions of halves.
 
     Whatever swings or strikes within half a trace is in neither mean. Parameters as of :func:`estimate_mechanics`;
-    nothing where it finds no inertia, and no friction that may be more than what turned the shaft.
+    nothing where it finds no inertia, and no friction that may be more than what turned the shaft. Nothing drives a
+    shaft the faster it turns: a B below zero is none, and tau_c is what it is without, known no better than with it.
     """
     runs = [_fast(_window(run)) for run in runs]
     step = encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, 0.0, direction, 1, step, NO_HARMONICS, 0.0)[1] for run in runs]
-    values, stds, _ = _mean_motion(blocks, power=1.0)
+    values, covariance, _ = _mean_motion(blocks, power=1.0)
+    stds = np.sqrt(np.diag(covariance)).tolist()
     if not values[0] > 0.0:
         return {}
+    if values[1] < 0.0:
+        values = values - covariance[:, 1] * (values[1] / covariance[1, 1])  # least squares with B = 0
     if COVERAGE_FACTOR * max(stds[1] * fastest(blocks), stds[2]) > largest_torque(blocks):
         values = values[:1]
     scale, systematic = math.hypot(MEAN_STD, scale_std), (tolerance or SensorTolerance()).inertia
@@ -389,8 +394,8 @@ def _start(runs: Sequence[Run]) -> Array:
     return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
 
 
-def _mean_motion(runs: Sequence[Run], power: float = 0.0) -> tuple[Array, list[float], list[float]]:
-    """Return J, B, tau_c of the mean torques and motions of half traces, their deviations, and the first states.
+def _mean_motion(runs: Sequence[Run], power: float = 0.0) -> tuple[Array, NDArray[np.float64], list[float]]:
+    """Return J, B, tau_c of the mean torques and motions of half traces, their covariance, and the first states.
 
     With a ``power`` of 1 errors are a share of the acceleration: pushes tell J, coasting friction.
     """
@@ -410,7 +415,7 @@ def _mean_motion(runs: Sequence[Run], power: float = 0.0) -> tuple[Array, list[f
     change = np.abs(np.array(rows)[:, 0])
     weight = (change + 1e-3 * np.max(change)) ** -power
     x, covariance, residual, _ = linear_solve(np.array(rows), np.array(torques), weight)
-    return x, np.sqrt(np.diag(covariance) * (residual @ residual) / (len(rows) - len(x))).tolist(), states
+    return x, covariance * (residual @ residual) / (len(rows) - len(x)), states
 
 
 def _fit(runs: Sequence[Run], start: Array, elastic: bool) -> tuple[Fit, float, Sequence[Run]]:
