@@ -64,9 +64,11 @@ double pmsm_leg_dead_voltage(const pmsm_leg_error *error, int leg, double i)
 
 double pmsm_leg_error_voltage(const pmsm_leg_error *error, int leg, double i)
 {
+    if (error->shape == PMSM_DEADTIME_TANH || error->shape == PMSM_DEADTIME_SIGN) /* one curve for both */
+        return (error->V_dead[leg] + error->V_device) * pmsm_real64_tanh(i * error->i_knee_inverse);
     double v = pmsm_leg_dead_voltage(error, leg, i);
     if (error->V_device > 0.0)
-        v += error->V_device * pmsm_real64_tanh(i * error->V_device_knee_inverse);
+        v += error->V_device * pmsm_real64_tanh(i * error->i_knee_inverse);
     return v;
 }
 
@@ -106,7 +108,7 @@ static void begin_averaged(pmsm_inverter *inverter, const double duty[3])
     if (!(knee > 0.0))
         knee = I_LEAST;
     error->shape = V_max > 0.0 ? setup->shape : (uint32_t)PMSM_DEADTIME_NONE;
-    error->i_knee_inverse = error->V_device_knee_inverse = 1.0 / knee;
+    error->i_knee_inverse = 1.0 / knee;
     error->V_device = setup->V_switch;
     for (int x = 0; x < 3; x++) {
         error->V_dead[x] = inverter->U_dc * setup->dead_time[x] / inverter->T_s;

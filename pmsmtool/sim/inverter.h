@@ -37,7 +37,6 @@ typedef struct pmsm_leg_error {
     double V_dead[3];        /* V, plateau of each leg */
     double i_knee_inverse;   /* 1/A */
     double V_device;         /* V */
-    double V_device_knee_inverse;
 } pmsm_leg_error;
 
 typedef struct {
