@@ -78,6 +78,7 @@ typedef struct {
     double T_s, U_dc;
     uint32_t exact;          /* 1: averaged without any error */
     double L_min, brief_rate; /* H, sets substeps; 1/s, of the shortest time constant over the midpoint rule's reach */
+    double error_rate;       /* 1/s, of the averaged error at its steepest */
     uint32_t gates;
     uint32_t circuit;        /* 1: legs are treated as circuits (gates off, an open phase, or switched) */
     uint32_t substeps;       /* per period, averaged model */
