@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Flux = Callable[[Array, Array], tuple[Array, Array]]
 
-COLUMNS, ROWS = 121, 97
-"""Points of a search along i_d, and along i_q for each of them."""
+COLUMNS, LATER_COLUMNS, ROWS = 121, 41, 97
+"""Points of the first and of the later searches along i_d, and along i_q for each of them."""
 
 SHRINK = 0.06
-"""Width of the next search around the best column, relative to this one."""
+"""Half width of the next search around the best column, relative to this one: more than 2 / 40, a later column's."""
 
 ROUNDS = 9
 """0.06^9 = 1e-11 of the first width."""
@@ -92,7 +92,7 @@ def zoom(case: Case, best_of: Callable[[Array], tuple[Array, Array, Array]]) -> 
     for round_ in range(ROUNDS):
         found: list[tuple[float, float, float]] = []
         for start, end in spans:
-            i_d, i_q, cost = best_of(np.linspace(start, end, COLUMNS))
+            i_d, i_q, cost = best_of(np.linspace(start, end, LATER_COLUMNS if round_ else COLUMNS))
             order = np.argsort(cost)[: 40 if round_ == 0 else 1]
             found += [(float(i_d[k]), float(i_q[k]), float(cost[k])) for k in order if math.isfinite(cost[k])]
         found.sort(key=lambda point: point[2])

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The real installations: pip, a fresh environment, a copy of the sources; a wheel by the system's compiler, and an
-editable installation by ziglang.
+"""The real installation that a fresh machine makes: pip, a new environment, a copy of the sources, and no compiler.
 
-Dependencies are left out (``--no-deps``): what is asked here is what this package does itself. The third, editable by
-the system's compiler, is the one that these tests run in; what each kind requires says ``test_compiler.py``.
+Dependencies are left out (``--no-deps``): what is asked here is what this package does itself. The editable
+installation is the one that these tests run in; what each kind requires says ``test_compiler.py``.
 """
 
 from __future__ import annotations
@@ -60,11 +59,8 @@ class Installation:
         return done.stdout.splitlines()
 
 
-def install(folder: Path, *, editable: bool, compilers: bool) -> Installation:
-    """Install a copy of this checkout in a fresh environment, by the system's compiler alone or without any.
-
-    The page of reports needs ziglang beside a compiler; that is what the environment of these tests was built with.
-    """
+def install(folder: Path) -> Installation:
+    """Install a copy of this checkout in a fresh environment, where no compiler is found."""
     sources = folder / "checkout"
     for name, path in wheel.source_files(ROOT).items():
         (sources / name).parent.mkdir(parents=True, exist_ok=True)
@@ -74,13 +70,9 @@ def install(folder: Path, *, editable: bool, compilers: bool) -> Installation:
     venv.create(folder / "environment", with_pip=False)
     python = folder / "environment" / "bin" / "python"
     env = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "CC")}
-    if compilers:
-        env["CC"] = next(filter(shutil.which, CANDIDATES), "")
-    else:
-        env["PATH"] = str(folder / "environment" / "bin")
-        assert not any(shutil.which(name, path=env["PATH"]) for name in CANDIDATES)
-    what = ["-e", str(sources)] if editable else [str(sources)]
-    command = [sys.executable, "-m", "pip", "--python", str(python), "install", "-v", "--no-deps", *what]
+    env["PATH"] = str(folder / "environment" / "bin")
+    assert not any(shutil.which(name, path=env["PATH"]) for name in CANDIDATES)
+    command = [sys.executable, "-m", "pip", "--python", str(python), "install", "-v", "--no-deps", str(sources)]
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
     log = done.stdout + done.stderr
     if done.returncode != 0 and any(text in log for text in NO_INDEX):
@@ -99,7 +91,8 @@ def data_lines(root: Path) -> list[str]:
 
 
 def test_installed_wheel_has_kernels_and_data_and_leaves_the_sources_clean(tmp_path: Path) -> None:
-    found = install(tmp_path, editable=False, compilers=True)
+    found = install(tmp_path)
+    assert "compiled by ziglang" in found.log
     package = next((tmp_path / "environment").rglob("site-packages")) / "pmsmtool"
     assert found.probe(tmp_path) == [str(package / "_native"), *data_lines(package / "_data")]
     left = {path.name for path in found.sources.iterdir()} - {name.split("/")[0] for name in wheel.source_files(ROOT)}
@@ -107,13 +100,3 @@ def test_installed_wheel_has_kernels_and_data_and_leaves_the_sources_clean(tmp_p
     assert not (found.sources / "pmsmtool" / "_native").exists()
     help_text = subprocess.run([tmp_path / "environment/bin/pmsmtool", "--version"], capture_output=True, text=True)
     assert "No module named 'click'" in help_text.stderr  # the entry point is there; its dependencies were left out
-
-
-@pytest.mark.skipif(
-    not any(map(shutil.which, CANDIDATES)),
-    reason="no compiler: these tests run in such an installation",
-)
-def test_without_a_compiler_ziglang_builds_an_editable_installation_that_points_to_the_checkout(tmp_path: Path) -> None:
-    found = install(tmp_path, editable=True, compilers=False)
-    assert "compiled by ziglang" in found.log
-    assert found.probe(tmp_path) == [str(found.sources / "pmsmtool" / "_native"), *data_lines(found.sources)]
