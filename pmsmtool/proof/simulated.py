@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -33,6 +34,7 @@ from pmsmtool.proof.plan import Conditions, Experiment, ProofPlan
 from pmsmtool.proof.simulated_move import hold, record_move
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
 from pmsmtool.sim.kernel import Params, Part, Setup, Simulation
+from pmsmtool.sim.monte_carlo import cores
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.signals import Truth
 from pmsmtool.sim.simulated_machine import build_setup
@@ -157,10 +159,17 @@ class SimulatedDrives:
         ndarray, shape (runs, signals, pattern rows)
             Signals as the experiment lists them.
         """
+        count = len(self.setups) if runs is None else runs
+        # a drive is simulated in C, beside the others
+        with ThreadPoolExecutor(cores()) as pool:
+            responses = pool.map(lambda row: self._response(row, experiment, defect), range(count))
+            return np.stack([response.T for response in responses])
+
+    def _response(self, row: int, experiment: Experiment, defect: Defect | None) -> Array:
+        """Simulate an experiment on one drive, shape (pattern rows, signals)."""
         if experiment.move is not None:
-            count = len(self.setups) if runs is None else runs
-            return np.stack([self._move(k, experiment, defect).T for k in range(count)])
-        drives = [self._start(k, experiment, defect) for k in range(len(self.setups) if runs is None else runs)]
+            return self._move(row, experiment, defect)
+        drive = self._start(row, experiment, defect)
         in_speed_mode = experiment.excitation.point is Injection.SPEED
         run_in = COAST_PERIODS[1]
         if in_speed_mode:
@@ -170,17 +179,15 @@ class SimulatedDrives:
             machine = self._nominal.machine
             slowest_s = max(machine.L_d, machine.L_q) / (machine.R_copper + machine.R_fixed)
             run_in = min(max(run_in, round(HOLD * slowest_s / self._T_s)), LONGEST_HOLD)
-        for row, drive in enumerate(drives):
-            self._get_ready(drive, row, experiment, run_in)
-            if experiment.base_rad_s and not in_speed_mode:
-                drives[row] = self._at_speed(drive, row, experiment, defect, run_in)
-        wanted = [DRIVE_SIGNALS[name][0] for name in experiment.signals]
-        for drive in drives:
-            _excite(drive, experiment.excitation)
-        records = [drive.record(wanted, experiment.rows, experiment.decimation) for drive in drives]
-        for drive in drives:
-            drive.run(experiment.rows * experiment.decimation)
-        return averaged(np.stack(records).transpose(0, 2, 1), experiment)
+        self._get_ready(drive, row, experiment, run_in)
+        if experiment.base_rad_s and not in_speed_mode:
+            drive = self._at_speed(drive, row, experiment, defect, run_in)
+        _excite(drive, experiment.excitation)
+        record = drive.record(
+            [DRIVE_SIGNALS[name][0] for name in experiment.signals], experiment.rows, experiment.decimation
+        )
+        drive.run(experiment.rows * experiment.decimation)
+        return averaged(record.T, experiment).T
 
     def _at_speed(
         self, drive: Simulation, row: int, experiment: Experiment, defect: Defect | None, run_in: int
