@@ -10,7 +10,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -191,6 +191,7 @@ class Simulation:
         self._keep = keep
         self.setup = setup
         self._buffers: dict[object, object] = {}
+        self._parts: dict[Part, int] = {}
         # 8-byte units: the structs hold doubles
         self._drive_memory = (_f64 * (self.library.pmsm_sim_layout(_LAYOUT_DRIVE) // 8 + 1))()
         self._sim_memory = (_f64 * (self.library.pmsm_sim_layout(_LAYOUT_SIM) // 8 + 1))()
@@ -212,34 +213,37 @@ class Simulation:
 
     def part(self, part: Part) -> int:
         """Return the address of a part of the drive."""
-        return int(self.library.pmsm_sim_part(self.drive, int(part)))
+        address = self._parts.get(part)
+        if address is None:
+            address = self._parts[part] = int(self.library.pmsm_sim_part(self.drive, int(part)))
+        return address
 
-    @property
+    @cached_property
     def params(self) -> Params:
         """The drive's active parameters."""
         return Params.from_address(self.part(Part.PARAMS))
 
-    @property
+    @cached_property
     def reference(self) -> Reference:
         """What the drive is asked to do."""
         return Reference.from_address(self.part(Part.REFERENCE))
 
-    @property
+    @cached_property
     def excitation(self) -> Any:
         """The drive's excitation."""
         return STRUCTS["pmsm_excitation"].from_address(self.part(Part.EXCITATION))
 
-    @property
+    @cached_property
     def recorder(self) -> Any:
         """The drive's trace recorder."""
         return STRUCTS["pmsm_recorder"].from_address(self.part(Part.RECORDER))
 
-    @property
+    @cached_property
     def average(self) -> Any:
         """The drive's window averages."""
         return STRUCTS["pmsm_average"].from_address(self.part(Part.AVERAGE))
 
-    @property
+    @cached_property
     def position(self) -> Any:
         """The drive's position controller."""
         return STRUCTS["pmsm_position"].from_address(self.part(Part.POSITION))

@@ -35,13 +35,19 @@ class Entry:
         The application's hooks for reading and writing.
     """
 
-    __slots__ = ("code", "high", "low", "nan_allowed", "readable", "row", "sink", "size", "source", "value", "writable")
+    __slots__ = (
+        "_is_float", "_range", "code", "high", "low", "nan_allowed", "readable", "row", "sink", "size", "source", "value",
+        "writable",
+    )  # fmt: skip
 
     def __init__(self, row: ObjectRow, node: int) -> None:
         self.row = row
         kind = row.data_type
         self.size = kind.size
         self.code = struct.Struct("<" + kind.letter) if kind.letter else None
+        self._is_float = kind.is_float
+        bits = 8 * self.size
+        self._range = (-(1 << bits - 1), (1 << bits - 1) - 1) if kind.is_signed else (0, (1 << bits) - 1)
         self.low, self.high = (_held_as(self.code, bound) if kind.is_float else bound for bound in (row.low, row.high))
         self.nan_allowed = row.default == "nan"
         self.readable = row.access != "wo"
@@ -70,11 +76,9 @@ class Entry:
         code = self.code
         if code is None:
             raise TypeError(f"{self.row.key} is not a number")
-        if self.row.data_type.is_float:
+        if self._is_float:
             return code.pack(number)
-        bits = 8 * self.size
-        signed = self.row.type.startswith("I")
-        lowest, highest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+        lowest, highest = self._range
         return code.pack(min(max(round(number), lowest), highest))
 
     def put(self, number: float) -> None:
@@ -93,7 +97,7 @@ class Entry:
         if code is None:
             return
         value = code.unpack(data)[0]
-        if self.row.data_type.is_float and not math.isfinite(value):
+        if self._is_float and not math.isfinite(value):
             if not (self.nan_allowed and math.isnan(value)):
                 raise Refused(AbortCode.VALUE)
             return
