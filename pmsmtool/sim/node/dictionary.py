@@ -36,8 +36,8 @@ class Entry:
     """
 
     __slots__ = (
-        "_is_float", "_range", "code", "high", "low", "nan_allowed", "readable", "row", "sink", "size", "source", "value",
-        "writable",
+        "_is_float", "_range", "code", "high", "low", "nan_allowed", "readable", "row", "sink", "size", "source",
+        "value", "writable",
     )  # fmt: skip
 
     def __init__(self, row: ObjectRow, node: int) -> None:
