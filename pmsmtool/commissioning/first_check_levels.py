@@ -56,7 +56,7 @@ from pmsmtool.trace import Trace
 UNITS = {"V": 1e3, "0.1 V": 1e2, "0.01 V": 10.0}
 """What makers count in 0x6079 in place of mV, and how much more that is."""
 UNSEEN = {
-    "supply": "the drive does not show its DC link (0x6079)",
+    "supply": "the drive does not show its DC link (0x6079, or an object in its map)",
     "phases": "the drive shows no current of a single phase",
     "current sensors": "the drive shows no current of a single phase",
     "shaft": "mend what is wrong first",
@@ -238,7 +238,9 @@ def _supply(rest_v: float, turn: Trace | None, stated_v: float | None) -> Findin
             if judge_supply(factor * rest_v, None, stated_v).verdict != OK:
                 continue
             fallen = judge_supply(rest_v, turn, None)
-            shown = f"0x6079 shows {1e3 * rest_v:.0f}: no mV (CiA 402), but {unit} of the stated {stated_v:.4g} V"
+            shown = (
+                f"DC link {rest_v:.3g} V if it is counted in mV (CiA 402); in {unit} it is the stated {stated_v:.4g} V"
+            )
             odd = Finding("supply", NOT_CHECKED, shown, "state its unit in a map of your own ([signals] U_dc_v)")
             return odd if fallen.verdict == OK else fallen
     return judge_supply(rest_v, turn, stated_v)

@@ -352,7 +352,7 @@ def no_link(U_dc_v: float) -> str:
     if not U_dc_v:
         return NO_LINK
     return (
-        f"{NO_LINK}: the drive is energised and shows a DC link of {U_dc_v:.3g} V, so that 0x6079 does not count mV; "
+        f"{NO_LINK}: the drive is energised and shows a DC link of {U_dc_v:.3g} V, so that its unit is another; "
         "state its unit in a map of your own ([signals] U_dc_v)"
     )
 

@@ -253,13 +253,13 @@ def test_identify_names_wrong_wiring_of_an_epos4(tool: Tool, key: str, code: int
 def test_a_link_in_another_unit_is_no_supply_that_is_off(counts: int, unit: str) -> None:
     """A drive whose 0x6079 counts volts had its supply WRONG, and nothing else was looked at."""
     row = link_row(1e-3 * counts, None, 48.0)
-    assert row.verdict == NOT_CHECKED and f"0x6079 shows {counts}: no mV (CiA 402), but {unit} of" in row.shown
+    assert row.verdict == NOT_CHECKED and f"in {unit} it is the stated 48 V" in row.shown
     sagging = Trace(np.zeros(2), {"U_dc_v": 1e-3 * counts * np.array([1.0, 0.5])}, {"U_dc_v": "V"})
     assert link_row(1e-3 * counts, sagging, 48.0).verdict == WRONG
     assert link_row(1e-3 * counts, None, 300.0).verdict == WRONG
 
 
 def test_a_link_that_an_energised_drive_cannot_have_tells_no_flux_linkage() -> None:
-    """0.048 V: the flux linkage was a thousandth, and was what was blamed."""
-    assert "0.048 V, so that 0x6079 does not count mV" in no_link(0.048)
+    """0.048 V: whatever the voltage limit then tells of the flux linkage, it is no measurement."""
+    assert "0.048 V, so that its unit is another" in no_link(0.048)
     assert no_link(0.0) == NO_LINK

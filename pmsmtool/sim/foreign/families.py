@@ -179,6 +179,7 @@ def _nanotec(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     yield Law(0x203B, 1, source, set_up=1000.0 * RMS * motor.i_nom_apk)
     yield Law(0x2039, 1, source, show=lambda behind: 1000.0 * RMS * behind.i_d_a())
     yield _current(0x2039, 2, 1000.0 * RMS, source)
+    yield Law(0x4014, 1, "mV: the file's own name of it", show=lambda behind: 1000.0 * behind.U_dc_v())
 
 
 def _faulhaber(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
