@@ -320,6 +320,13 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
         "axis_following_error_rad": error,
         "axis_friction_error_rad": (source.machine.tau_c_nm or 0.0) / position.pid[0],
     }
+    behind = error + float(predicted["axis_friction_error_rad"])
+    if behind > WAY_RAD:
+        raise DesignInfeasible(
+            f"with margins over the tolerance box a move of half a turn stays {math.degrees(behind):.3g} deg behind",
+            where="axis", likely="a resonance that is little damped, or of an unknown damping, without a notch",
+            hint="measure it with `identify frf`, ask for smaller margins, or keep the gains that the drive holds",
+        )  # fmt: skip
     base = replace(base, facts={**base.facts, **predicted})
     values = axis_values(source, speed, position, share, profile, drive, how)
     return AxisDesign(_judged(base, values, box, speed, position), box, speed, position)

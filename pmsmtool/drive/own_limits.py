@@ -122,8 +122,8 @@ def put_limit(node: DriveNode, limit: Quantity | None, wanted: float, most: floa
 
 
 def refuse_no_current(node: DriveNode, i_max: float) -> None:
-    """Refuse to begin where the drive allows no current."""
-    if not i_max > 0.0:
+    """Refuse to begin where the drive allows no current; what is no number is told as what limits nothing."""
+    if i_max <= 0.0:
         raise SafetyRefusal(
             "the drive allows no current: its rated current or one of its limits (0x6073, 0x6072) is 0",
             where=f"node {node.node}", likely="the drive is as it left its factory: the motor is not set up",

@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from benchmarks.axis_loads import loaded
 from pmsmtool.axis.design import PID, AxisGains, AxisRequest, axis_path, from_pid, profile_within, with_axis
 from pmsmtool.axis.loops import lifted
 from pmsmtool.axis.search import Box, Limits, axis_margins, stiffest
@@ -171,6 +172,13 @@ def test_what_cannot_be_designed_is_refused() -> None:
     path, _ = axis_path(tune(source), ASKED, drive, mechanics_of(source))
     with pytest.raises(DesignInfeasible, match="no gains have 120 degree"):
         stiffest(Box(path, ()), Limits(120.0, 6.0))
+
+
+@pytest.mark.chain
+def test_gains_that_leave_the_shaft_where_it_is_are_refused() -> None:
+    """A load at 93 Hz without a notch: a K_v of 0.28 1/s, which friction holds 195 degrees behind: it was written."""
+    with pytest.raises(DesignInfeasible, match="a move of half a turn stays 197 deg behind"):
+        design_axis(loaded(946)[1], TuneRequest(), AxisRequest(), load_family("ingenia"))
 
 
 @pytest.mark.chain
