@@ -112,7 +112,7 @@ def learn_command(
             *envelope.lines(),
             *unlike_stated(node),
             "the shaft turns at up to 70 % of the speed limit and takes steps, with the drive's own speed loop",
-            *(["then its position loop moves it by three turns and back, some times"] if POSITION in found else []),
+            *(["then its position loop moves it by three turns, 13 times at most"] if POSITION in found else []),
             *(f"{gain.name} in {gain.address} holds {gain.counts:.9g}: it is changed while the voltage is off, and "
               "restored" for gain in found.values()),
             "nothing is stored in the drive; every changed object is restored",

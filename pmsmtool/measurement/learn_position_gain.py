@@ -41,9 +41,9 @@ TRAVEL = 1.3
 """Largest travel, of the way."""
 BEHIND = 0.5
 """Largest lag of a shaft that does not follow, of the way."""
-SEEN, AIM, GROWTH = 0.3, 0.8, 8.0
-"""Share of the speed from which a feed-forward is clearly seen, the one aimed at until then, and by how much its counts
-grow at most."""
+SEEN, AIM, GROWTH, FORWARD_MOVES = 0.3, 0.8, 8.0, 10
+"""Share of the speed from which a feed-forward is clearly seen, the one aimed at until then, by how much its counts
+grow at most, and in how many moves: 8^10 is more than four bytes hold."""
 
 
 def position_gain(node: DriveNode, address: tuple[int, int] | None = None) -> GainObject | None:
@@ -116,7 +116,7 @@ def _moved(
         found[POSITION] = told
         if forward is not None and told.scale is not None:
             counts = forward.counts or 1.0
-            while True:
+            for _ in range(FORWARD_MOVES):
                 put(forward, counts)
                 trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
                 share, std = fed_share(trace, lags[0][1])

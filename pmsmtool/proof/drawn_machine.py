@@ -53,6 +53,8 @@ OFFSET_SHARE = 0.001
 MISMATCH = 0.002
 """Standard deviations of sensor offsets (of I_max) about what they show before the proof, and of the phases' gains
 against each other."""
+BENT = "L_d changes with its current, and there is no flux map of it: the predicted bands are wider"
+"""A line of the proof's report."""
 LEAST_BENT = 0.3
 """Least L_d that its slope may leave, of that at the bias: the slope of a small ripple holds for no such change."""
 SEEN_SHARES, EDDY_FACTOR = (0.5, 1.5), 2.0
@@ -117,14 +119,20 @@ def draw_machine(
     return setup
 
 
+def bend_of(machine: MachineFile) -> float:
+    """Return the slope of L_d at its bias, relative (1/A), where no flux map holds it; 0: none was seen."""
+    bend_per_a = machine.conditions.get("L_d_bend_per_a")
+    return bend_per_a if isinstance(bend_per_a, float) and machine.flux_map is None else 0.0
+
+
 def _draw_saturation(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
     """Draw the inductances at currents of the steps, where L_d bends with its current and no flux map says how.
 
     L_d within half of the rated current either way, by its slope at the bias. How much of that the bias took off L_q is
     not known, up to the same share, nor what the steps of i_q take off: half of it.
     """
-    bend_per_a, L_d = machine.conditions.get("L_d_bend_per_a"), machine.estimates.get("L_d_h")
-    if not isinstance(bend_per_a, float) or L_d is None or machine.flux_map is not None:
+    bend_per_a, L_d = bend_of(machine), machine.estimates.get("L_d_h")
+    if not bend_per_a or L_d is None:
         return
     out, bias_a = setup.machine, L_d.i_d_apk
     within_a = 0.5 * (machine.machine.I_nom_apk or 2.0 * bias_a)

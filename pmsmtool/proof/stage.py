@@ -42,7 +42,7 @@ from pmsmtool.identification.wiring import SUPPLY
 from pmsmtool.machine.parameters import Brake, Load, Shaft
 from pmsmtool.measurement.limits import within_supply
 from pmsmtool.npz_file import npz_bytes, read_npz
-from pmsmtool.proof.drawn_machine import SEEN_SHARES, U_DC_SPREAD
+from pmsmtool.proof.drawn_machine import BENT, SEEN_SHARES, U_DC_SPREAD, bend_of
 from pmsmtool.proof.judgement import Judgement, judge, with_ripple
 from pmsmtool.proof.measured import SpeedNotReached, run_experiments
 from pmsmtool.proof.plan import LINK, Conditions, Experiment, ProofPlan, plan_proof
@@ -218,7 +218,8 @@ def prove_stage(
             raise
         event = error  # the guard has stopped the machine and restored the drive
     stage = _stage(plan, record, event, digest, folder)
-    return replace(stage, not_checked=_beyond(design, conditions))
+    wider = (BENT,) if bend_of(design.machine) else ()
+    return replace(stage, not_checked=_beyond(design, conditions), fallbacks=(*stage.fallbacks, *wider))
 
 
 def rated_rpm(design: Design) -> float:

@@ -13,6 +13,7 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.proof.drawn_machine import bend_of
 from pmsmtool.proof.plan import Conditions, plan_proof
 from pmsmtool.proof.simulated import SimulatedDrives
 from pmsmtool.resources import data_folder
@@ -38,6 +39,7 @@ def test_inductances_are_drawn_over_the_currents_of_the_steps_where_they_bend() 
     at_bias = Estimate(L_d, 0.005 * L_d, 0.0, "H", i_d_apk=0.5 * I_nom, i_q_apk=0.0)
     known = replace(base, estimates={"L_d_h": at_bias}, std={"L_d_h": 0.005 * L_d, "L_q_h": 0.005 * L_q})
     bent = replace(known, conditions={"L_d_bend_per_a": -0.3 / I_nom})
+    assert (bend_of(known), bend_of(bent)) == (0.0, -0.3 / I_nom)
     spans = []
     for machine in (known, bent):
         design = tune(machine, TuneRequest(field_weakening="off"))
