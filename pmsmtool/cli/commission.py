@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import FOLDER, map_option, new_run, read_map, rehearsal_bus, runs_option
+from pmsmtool.cli.drive_access import FOLDER, REHEARSED, map_option, new_run, read_map, rehearsal_bus, runs_option
 from pmsmtool.cli.options import (
     FILE,
     HZ,
@@ -51,7 +51,8 @@ LIMITS = ("current", "speed")
     ),
 )
 @click.argument("machine", required=False, type=FILE)
-@click.option("--resume", type=FOLDER, metavar="RUN_DIR", help="Go on with a run where it ended.")
+@click.option("--resume", type=FOLDER, metavar="RUN_DIR", help="Go on with a run where it ended, with its motor file "
+              "and its limits; options of the design are given again.")  # fmt: skip
 @click.option("--rehearse", is_flag=False, flag_value="", metavar="FAMILY", help="Rehearse: MACHINE, simulated, behind "
               "the map of a drive family, or with --eds alone.")  # fmt: skip
 @click.option("--eds", metavar="FILE", help="Rehearse: MACHINE, simulated, behind the EDS or DCF of its drive.")
@@ -135,6 +136,8 @@ def commission_command(
         if rehearse == "" and eds is None:
             raise click.UsageError("--rehearse needs the name of a drive family, or --eds FILE")
         bus = rehearsal_bus(bus, eds=eds, family=rehearse or None, machine=machine)
+        if machine is None:
+            out.note(f"no MACHINE is given: the motor of {REHEARSED} is simulated, its values are unknown")
         for line in assumptions_of(eds, load_machine_file(machine)) if eds is not None and machine is not None else ():
             out.warn(f"{eds}: {line}")
     if accept and motion.yes:
@@ -145,7 +148,9 @@ def commission_command(
     begun = RunDirectory(resume) if resume is not None else None
     if begun is not None and machine is not None:
         raise ConfigError("MACHINE and --resume exclude each other", hint="a run keeps the machine it began with")
-    asked = _asked(machine if begun is None else _kept_nameplate(begun), motion, sensor_tol, flux_map, design)
+    known = machine if begun is None else _kept_nameplate(begun)
+    limits = motion if begun is None else _limits_as_begun(motion, begun)
+    asked = _asked(known, limits, sensor_tol, flux_map, design)
     if begun is not None:
         bus = _as_begun(bus, begun)
     elif bus.simulated():
@@ -191,10 +196,31 @@ def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDr
 
 
 def _kept_nameplate(run: RunDirectory) -> Path | None:
+    """Return the machine file that the run was begun with; what the drive held at its start is no data sheet."""
+    from pmsmtool.commissioning.commission import GIVEN
     from pmsmtool.identification.run_files import NAMEPLATE
 
     path = run.path / NAMEPLATE
-    return path if path.is_file() else None
+    return path if run.read().request.get(GIVEN, True) and path.is_file() else None
+
+
+def _limits_as_begun(motion: MotionOptions, run: RunDirectory) -> MotionOptions:
+    """Fill in the motion limits of a run where the command line names none; they bound its proof, too."""
+    from pmsmtool.files import read_text
+    from pmsmtool.identification.request import REQUEST, parse_request
+
+    path = run.path / REQUEST
+    if not path.is_file():
+        return motion
+    asked = parse_request(read_text(path), where=str(path))
+    return replace(
+        motion,
+        i_max_apk=motion.i_max_apk or asked.i_max_apk,
+        speed_max_rad_s=motion.speed_max_rad_s or asked.speed_max_rad_s,
+        shaft=motion.shaft or asked.shaft,
+        load=asked.load if motion.load == "none" else motion.load,
+        brake=asked.brake if motion.brake == "none" else motion.brake,
+    )
 
 
 def _asked(

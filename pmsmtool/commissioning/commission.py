@@ -12,7 +12,7 @@ import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from pmsmtool.commissioning.closed_stage import within_ratings
 from pmsmtool.commissioning.compared_stage import check_accepted, compared, refusal
@@ -35,7 +35,8 @@ from pmsmtool.errors import (
     VerifyMismatch,
 )
 from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.identification.run_files import NAMEPLATE
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.capabilities import Capabilities, reference_capabilities
 from pmsmtool.measurement.run_account import RunAccount, begin_run, status_of, text_of
 from pmsmtool.plain_text import by_reason
@@ -46,6 +47,8 @@ from pmsmtool.run_directory import RunDirectory, RunRecord, Stage
 FROM_TABLE = TuneRequest(field_weakening="lookup")
 """The chain's default design: the drive takes its current references from the table the chain makes and checks."""
 STAGES = ("identify", "tune", "lut", "margins", "flash", "verify", "prove")
+GIVEN = "machine_given"
+"""Key of a run's request: whether ``nameplate.toml`` was given, or is what the drive held at the start."""
 
 
 class Person(Protocol):
@@ -187,8 +190,7 @@ class Commissioning:
         record = self.run.read()
         self._check_drive(record)
         self.require = required_of(record, self.require)
-        if self.require:
-            self.run.write(replace(record, request={**record.request, "require": self.require}))
+        self.run.write(replace(record, request=self._kept_request(record)))
         self._account = account = RunAccount(self.run, self.progress.say)
         with account.kept():
             try:
@@ -198,6 +200,13 @@ class Commissioning:
                 raise Interrupted("the machine is off") from None
             finally:
                 self._make_sure()
+
+    def _kept_request(self, record: RunRecord) -> dict[str, Any]:
+        """Return what a resumed run needs of what was asked; a machine file that is given is kept in the run."""
+        kept = {GIVEN: self.nameplate is not None, **record.request}
+        if self.nameplate is not None and not (self.run.path / NAMEPLATE).is_file():
+            self.run.save(NAMEPLATE, dump_machine_file(self.nameplate))
+        return {**kept, "require": self.require} if self.require else kept
 
     def _carry_out_due(self, record: RunRecord, account: RunAccount) -> None:
         due = due_stages(self.run, record)
@@ -253,7 +262,9 @@ class Commissioning:
             if isinstance(error, NotAvailable) and not self.stages.whole:
                 self._not_available(name, number, error, clock.now() - start)
                 return
-            failed = Stage(name, status_of(error), clock.now() - start, note=text_of(error))
+            # the status says that it was interrupted, the note by what
+            note = "by Ctrl-C or another signal" if isinstance(error, KeyboardInterrupt) else text_of(error)
+            failed = Stage(name, status_of(error), clock.now() - start, note=note)
             # The error that ended the stage outranks a record that cannot be written.
             with contextlib.suppress(ConfigError):
                 self.run.add(failed)

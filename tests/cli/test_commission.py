@@ -23,6 +23,7 @@ from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli import consent
+from pmsmtool.cli.commission import _kept_nameplate
 from pmsmtool.commissioning import commission
 from pmsmtool.commissioning.commission import STAGES
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -30,6 +31,8 @@ from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map
 from pmsmtool.flash.restore import take_backup
+from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
+from pmsmtool.identification.run_files import NAMEPLATE
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.report.verdict import NEEDED
 from pmsmtool.resources import data_folder
@@ -219,6 +222,23 @@ def test_ctrl_c_while_the_machine_moves(command: str, wait: int, tool: Tool, mon
         assert "interrupted: the machine is stopped, voltage off, and the drive restored" in err
         assert "interrupted: interrupted" not in err
         assert backup(channel) == before
+    if command == "commission":
+        folder = the_run()[0]
+        assert (folder.path / NAMEPLATE).is_file() and _kept_nameplate(folder) is None, "it was no data sheet"
+
+
+def test_a_resumed_run_keeps_its_limits_and_its_machine(tool: Tool) -> None:
+    channel = ("-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:")
+    assert tool("commission", SHEET, *channel, "--yes", "--load", "gravity")[0] == 5, "it ends before its first stage"
+    run = the_run()[0]
+    kept = _kept_nameplate(run)
+    assert kept is not None and load_machine_file(kept).machine == load_machine_file(Path(SHEET)).machine
+    run.save(REQUEST, dump_request(IdentifyRequest(i_max_apk=3.0, speed_max_rad_s=40.0, shaft="coupled")))
+    code, _, err = tool("commission", *channel, "--resume", str(run.path))
+    assert code == 7 and "current   at most 3 Apk" in err and "speed     at most 382 rpm" in err
+    assert "shaft     coupled" in err
+    err = tool("commission", *channel, "--resume", str(run.path), "--i-max", "2Apk")[2]
+    assert "current   at most 2 Apk" in err and "speed     at most 382 rpm" in err
 
 
 # ---- consents ---------------------------------------------------------------------------------------------
