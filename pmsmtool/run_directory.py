@@ -158,6 +158,8 @@ class RunDirectory:
         hint = "give a directory that identify or commission made"
         if not path.exists():
             what = f"no {RECORD} here" if self.path.exists() else "no such folder"
+            if runs := sorted(self.path.glob(f"*/{RECORD}")):
+                what, hint = "this is a folder of runs", f"give one of them; the newest is {runs[-1].parent}"
             raise ConfigError(what, where=str(self.path), hint=hint)
         text = read_text(path, largest=ROWS_BYTES, hint=hint)
         try:

@@ -54,7 +54,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
         found = examine(node, given)
         own = not found.drive_map.staging  # the reference drive shows the layout of its set
         denied = contradictions(node, found.drive_map.cells) if own else {}
-    out.result("caps", _facts(found, denied), lambda: _lines(found, denied, out.verbosity > 0))
+    out.result("caps", _facts(found, denied), lambda: _lines(found, denied, out.verbosity > 0, asked=eds is None))
     for name, why in found.drive_map.not_written(BY_NAME).items():
         if name not in found.drive_map.left_out:
             out.detail(f"not written: {name}: {why}")
@@ -129,7 +129,7 @@ def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bo
     others = len(drive_map.not_written(BY_NAME).keys() - drive_map.left_out.keys())
     unwritten = _unwritten(found, denied)
     reasons = (
-        (drive_map.row_text(name) if sources or found.map_is_drives else name, why) for name, why in unwritten.items()
+        (drive_map.row_text(name) if sources or name in denied else name, why) for name, why in unwritten.items()
     )
     written = {name: drive_map.cells[name] for name in _written(found, denied)}
     rows = [(f"written: {name}", f"0x{row.index:04X}:{row.sub:02X}", row.wire) for name, row in written.items()]
@@ -144,12 +144,15 @@ def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bo
     ]
 
 
-def _lines(found: Capabilities, denied: Mapping[str, str], sources: bool) -> list[str]:
-    """Return what a person reads: what is had, then what is missing and for what, then what is written."""
+def _lines(found: Capabilities, denied: Mapping[str, str], sources: bool, *, asked: bool) -> list[str]:
+    """Return what a person reads: what is had, then what is missing and for what, then what is written.
+
+    ``asked``: a drive was asked; else node and serial number are none.
+    """
     identity = found.identity
+    who = f"{identity.name}  vendor {identity.vendor:#010x}  product {identity.product:#x}"
     lines = [
-        f"node {identity.node}  {identity.name}  vendor {identity.vendor:#010x}  product {identity.product:#x}  "
-        f"serial {identity.serial}",
+        f"node {identity.node}  {who}  serial {identity.serial}" if asked else who,
         f"map {found.drive_map.name} ({len(found.drive_map.cells)} parameters)  capability level {found.level}",
         *([f"recorder: {found.recorder}"] if found.recorder else []),
         *found.replaced,

@@ -62,6 +62,10 @@ def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
 
     wanted = load_parameters(design, drive_map)
     missing = drive_map.missing(wanted)
+    made_on = _map_of_run(design)
+    if drive_map.staging and made_on not in ("", drive_map.name):
+        out.warn(f"{design}: the run is of a drive of the map {made_on!r}, and this file is for the reference drive: "
+                 f"--map {made_on} makes one for that drive")  # fmt: skip
     if missing:
         few = ", ".join(missing[:SHOWN]) + (", ... (-v names all)" if len(missing) > SHOWN else "")
         count = f"{len(missing)} of {len(wanted.values) + len(wanted.tables)} parameters"
@@ -74,6 +78,12 @@ def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
         if name in drive_map.cells:
             out.detail(f"written: {drive_map.row_text(name)}")
     return wanted
+
+
+def _map_of_run(design: Path) -> str:
+    from pmsmtool.run_directory import RunDirectory
+
+    return str(RunDirectory(design).read().drive.get("map", "")) if (design / "run.json").is_file() else ""
 
 
 @export_command.command(

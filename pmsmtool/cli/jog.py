@@ -68,7 +68,7 @@ def jog_command(
 
     if (current_apk is None) == (speed_rad_s is None):
         raise ConfigError(
-            "give one of --current and --speed", hint="`pmsmtool jog --current 1A`, or `pmsmtool jog --speed 100rpm`"
+            "give one of --current and --speed", hint="`pmsmtool jog --current 1Apk`, or `pmsmtool jog --speed 100rpm`"
         )
     with open_drive(bus, read_map(map_file)) as drive:
         _refuse_beyond("current", current_apk or 0.0, drive.read("motor.I_max_apk"), "Apk", "motor.I_max_apk")
@@ -93,11 +93,21 @@ def jog_command(
             elif speed_rad_s is not None:
                 guard.command_speed(speed_rad_s)
             readings = _watch(guard, seconds)
+        if speed_rad_s is not None:
+            _warn_unless_reached(speed_rad_s, _means(readings), drive.read("motor.pole_pairs"), out)
     facts = {"seconds": seconds, "envelope": envelope, "dead_man": guard.proof, "readings": readings}
     heads = ("quantity", "mean", "unit")
     out.result(
         "jog", facts, lambda: table(heads, [(name, f"{value:.6g}", unit) for name, value, unit in _means(readings)])
     )
+
+
+def _warn_unless_reached(asked: float, means: list[tuple[str, float, str]], pole_pairs: float, out: Output) -> None:
+    speed = abs(next(value for name, value, _ in means if name == "omega_e_rad_s")) / pole_pairs
+    if abs(speed - abs(asked)) > abs(asked) / 2:
+        ran, wanted = rpm_from_rad_s(speed), rpm_from_rad_s(abs(asked))
+        out.warn(f"the shaft ran at {ran:.3g} rpm in place of {wanted:.3g} rpm: likely the drive is not set up "
+                 "(`pmsmtool param get 'speed.K*'`: gains of 0 give no torque), or the load holds it")  # fmt: skip
 
 
 def _refuse_beyond(quantity: str, value: float, limit: float, unit: str, name: str) -> None:

@@ -74,7 +74,7 @@ class _AllMissingAtOnce(click.Command):
 @click.option("--connection", type=click.Choice(["star", "delta"]), default="star", help="Winding connection.")
 @click.option("--r", "R_ohm", required=True, type=Quantity("resistance"), help="Resistance, e.g. 0.274ohm.")
 @click.option("--r-between", "R_between", type=_BETWEEN, default="line-line", help="Where it is measured.")
-@click.option("--r-temperature", "T_c", type=Quantity("temperature"), default="25degC", help="When it is measured.")
+@click.option("--r-temperature", "T_c", type=Quantity("temperature"), default="25degC", help="Temperature it is for.")
 @click.option("--l", "L_h", type=Quantity("inductance"), help="Inductance of both axes, e.g. 4.4mH.")
 @click.option("--l-d", "L_d_h", type=Quantity("inductance"), help="d inductance (the smaller line-line reading).")
 @click.option("--l-q", "L_q_h", type=Quantity("inductance"), help="q inductance (the larger line-line reading).")

@@ -309,7 +309,7 @@ def judged(
     )
     had = [STEP[name] for name, told in TOLD_BY.items() if set(told) & set(estimates)]
     lacking = {
-        STEP[name]: _refusal(why)
+        STEP[name]: _refusal(why, machine is not None)
         for name, told in TOLD_BY.items()
         for keys, why in missing.items()
         if told[0] in keys.split(", ") and not set(told) & set(estimates)
@@ -317,11 +317,15 @@ def judged(
     return Judgement(acceptance, verdicts_of([name for name in asked if name in TOLD_BY], lacking, had, acceptance))
 
 
-def _refusal(why: str) -> IdentificationError:
-    """Return the error of a quantity that is missing; a reason that has its name keeps it."""
+def _refusal(why: str, stated: bool) -> IdentificationError:
+    """Return the error of a quantity that is missing; a reason that has its name keeps it.
+
+    ``stated``: a machine file has it already.
+    """
     name, _, text = why.partition(": ")
     reason, what = (name, text) if name.startswith("E_") else (NOT_TOLD, why)
-    return IdentificationError(reason, what, hint="state it in MACHINE, or allow more current and speed")
+    more = "allow more current and speed"
+    return IdentificationError(reason, what, hint=more if stated else f"state it in MACHINE, or {more}")
 
 
 def stage_of(

@@ -342,7 +342,9 @@ def disagreement(psi_e: float, psi_t: float, pole_pairs: int) -> str:
     factors = [*_CONFUSIONS, (float(pole_pairs), "electrical and mechanical speed are mixed (pole pairs)")]
     size = max(ratio, 1.0 / ratio)
     near = [reason for factor, reason in factors if abs(size / factor - 1.0) <= _CONFUSION_WIDTH]
-    return f"{text}; a factor of {size:.4g}: {' or '.join(near)}" if near else text
+    unknown = "one of them is not in the kind (rms, peak, block) or not between the points that are stated"
+    likely = f"a factor of {size:.4g}: {' or '.join(near)}" if near else unknown
+    return f"{text}; {likely}; K_e was taken: to take K_t, leave out --ke"
 
 
 def machine_from_datasheet(sheet: Datasheet) -> DatasheetResult:

@@ -420,6 +420,12 @@ def test_jog_current(tool: Tool) -> None:
     assert found["dead_man"]["measured_s"] <= found["dead_man"]["declared_s"]
 
 
+def test_a_speed_jog_whose_shaft_stands_says_so(tool: Tool) -> None:
+    """Factory memory has speed gains of 0."""
+    code, _, err = tool("jog", "--speed", "100rpm", "--for", "0.5s", "--yes")
+    assert code == 0 and "the shaft ran at 0 rpm in place of 100 rpm" in err and "speed.K*" in err
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [

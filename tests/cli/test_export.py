@@ -30,6 +30,7 @@ from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.resources import data_folder
+from pmsmtool.run_directory import RunDirectory, new_record
 from tests.concise_dcf import read_concise
 from tests.firmware.exported_image import image_of_json
 from tests.foreign.data_sheets import epos4, write_eds
@@ -74,6 +75,15 @@ def test_same_set_same_bytes_from_design_set_and_folder(form: str, folder: Path,
         assert len({load_parameters(folder).content_hash()} | {c.split(b"\n")[2] for c in contents}) == 2
     assert len(contents) == 1
     assert str(folder).encode() not in contents.pop()
+
+
+def test_the_run_of_a_mapped_drive_names_the_map_of_its_file(folder: Path, tmp_path: Path, capsys) -> None:
+    run_of = RunDirectory(folder)
+    for made_on, warned in (("epos4", True), ("pmsmsim", False)):
+        run_of.write(new_record(["test"], drive={"map": made_on}, bus={}, versions={}))
+        export("dcf", folder, "-o", tmp_path / f"{made_on}.dcf")
+        assert ("this file is for the reference drive: --map epos4" in capsys.readouterr().err) is warned
+    (folder / "run.json").unlink()
 
 
 def test_a_dcf_is_read_by_canopen_and_gives_the_set_back(folder: Path, tmp_path: Path) -> None:

@@ -142,6 +142,7 @@ def test_caps_says_which_rows_the_drive_contradicts(home: Path, capsys: pytest.C
     assert any("motor.R_s_ohm 0x6410:07" in line and "the drive holds 4 bytes there" in line for line in said)
     assert any("torque_slope" in line and "the drive has no such object" in line for line in said)
     assert any(line.split()[:3] == ["written:", "motor.L_q_h", "0x6410:08"] for line in out.splitlines())
+    assert "serial" not in out.splitlines()[0], "no drive was asked"
 
 
 def test_diff_says_what_is_equal_and_what_is_not_compared(home: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -135,9 +135,10 @@ def test_what_is_missing_is_refused_by_its_reason_and_nothing_at_all_fails(known
     found = estimates(known)
     del found["R_s_ohm"]
     judgement = judged(found, {"R_s_ohm": "hidden by the inverter"}, ASKED, known)
-    assert judgement.verdicts.refused == {
-        "R": "E_NOT_MEASURED: hidden by the inverter (try: state it in MACHINE, or allow more current and speed)"
-    }
+    hidden = "E_NOT_MEASURED: hidden by the inverter"
+    assert judgement.verdicts.refused == {"R": f"{hidden} (try: allow more current and speed)"}
+    alone = judged(found, {"R_s_ohm": "hidden by the inverter"}, ASKED, None)
+    assert alone.verdicts.refused == {"R": f"{hidden} (try: state it in MACHINE, or allow more current and speed)"}
     only = {"J_per_psi": estimates(known, J_per_psi=1.5)["J_per_psi"]}
     assert judged(only, {}, ("mechanics",), known).verdicts.status == "fail"
 

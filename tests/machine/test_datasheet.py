@@ -134,7 +134,7 @@ def test_resistance_is_brought_to_20_degrees():
 def test_a_torque_constant_that_contradicts_is_named(factor, says):
     K_t = parse_torque_constant(f"{1.5 * P * PSI * factor!r}Nm/Apk")
     result = machine_from_datasheet(sheet(K_t=K_t))
-    assert says in result.warnings[0]
+    assert says in result.warnings[0] and result.warnings[0].endswith("K_e was taken: to take K_t, leave out --ke")
     assert result.machine_file.machine.psi_f_wb == pytest.approx(PSI)  # K_e decides
 
 
