@@ -37,7 +37,7 @@ def diff_command(
     """
     from pmsmtool.commissioning.report_page import verdict
     from pmsmtool.errors import CheckFailed, ConfigError
-    from pmsmtool.identification.compared_runs import differences, other_parameters, same_drive, told, within
+    from pmsmtool.identification import compared_runs as compared
     from pmsmtool.identification.run_files import read_run
 
     if tol is not None and not 0.0 <= tol < 1.0:
@@ -50,18 +50,21 @@ def diff_command(
         _diff_of_moves(first, second, check, out)
         return
     (record, file), (other_record, other) = read_run(first), read_run(second)
-    same = same_drive(record.drive, other_record.drive)
-    rows = differences(file.estimates, other.estimates, same_sensors=same, machine=file.machine)
-    rows = rows if tol is None else within(rows, tol)
-    cells = [(*told(row), row.verdict) for row in rows]
+    same = compared.same_drive(record.drive, other_record.drive)
+    had = [compared.measured(each.estimates) for each in (file, other)]
+    rows = compared.differences(*had, same_sensors=same, machine=file.machine)
+    rows = rows if tol is None else compared.within(rows, tol)
+    cells = [(*compared.told(row), row.verdict) for row in rows]
     changed = [row.name for row in rows if row.verdict != "agrees"]
     alone = sum("only" in row.verdict for row in rows)
     last = f"{len(rows) - len(changed)} of {len(rows) - alone} quantities agree"
     if tol is None:
         last += " (one drive: without its sensors' part)" if same else " (two drives: with the sensors' part)"
     last += f"; {alone} in one run alone" if alone else ""
+    given = sorted({*file.estimates, *other.estimates} - {*had[0], *had[1]})
+    last += f"; as given, not compared: {', '.join(given)}" if given else ""
     words = [verdict(path).word for path in (first, second)]
-    sets = other_parameters(first, second, tol or 0.0)
+    sets = compared.other_parameters(first, second, tol or 0.0)
     lines = [last, f"verdict: {' -> '.join(words)}"]
     if sets is not None:
         more = "; `pmsmtool param diff FIRST SECOND` lists them" if sets else ""

@@ -116,6 +116,14 @@ def test_two_runs_on_the_command_line(tmp_path: Path) -> None:
     assert isinstance(outcome.exception, ConfigError) and "run.json" in str(outcome.exception)
 
 
+def test_what_neither_run_measured_does_not_agree(tmp_path: Path) -> None:
+    """A drive with fixed firmware gives J alone; R of the data sheet was one of six that agreed."""
+    given = {"R_s_ohm": replace(R, source="datasheet"), "psi_f_wb": PSI}
+    first, second = run_of(tmp_path, "a", given), run_of(tmp_path, "b", given)
+    out = CliRunner().invoke(cli, ["diff", str(first), str(second), "--check"]).stdout
+    assert "1 of 1 quantities agree (one drive: without its sensors' part); as given, not compared: R_s_ohm" in out
+
+
 def test_verdicts_and_parameters_of_two_runs_are_compared(tmp_path: Path) -> None:
     """A quantity that one run alone has is no quantity that disagrees; the verdict and the set were not looked at."""
     first = run_of(tmp_path, "a", {"R_s_ohm": R, "psi_f_wb": PSI})
