@@ -318,15 +318,15 @@ class _Person:
 
 @contextmanager
 def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
-    """Write the report whatever ends the chain; a run that was declined before anything moved leaves no trace."""
-    from pmsmtool.commissioning.commission import write_report
+    """Write the report whatever ends the chain; a run that was declined before anything was measured is removed."""
+    from pmsmtool.commissioning.commission import has_measured, write_report
     from pmsmtool.errors import Declined
 
     begun = time.monotonic()
     try:
         yield
     except BaseException as error:
-        if isinstance(error, Declined) and fresh and not run.read().passed("identify"):
+        if isinstance(error, Declined) and fresh and not has_measured(run):
             shutil.rmtree(run.path, ignore_errors=True)
             raise
         try:

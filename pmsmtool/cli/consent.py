@@ -133,7 +133,7 @@ def _ask(
         out.warn(f"--yes alone answers only for a simulated drive; missing here: {', '.join(missing)}")
     if not person_present():
         raise Declined(
-            f"no terminal to ask for consent to {_NAMES[subject]}: nothing was done",
+            f"no terminal to ask for consent to {_NAMES[subject]}: {_NOTHING[subject]}",
             likely="standard input or standard error is not a terminal",
             hint="--yes" if simulated or not missing else _lacking(missing, serial),
         )
@@ -143,7 +143,7 @@ def _ask(
         agreed = False
     if not agreed:
         raise Declined(
-            f"consent to {_NAMES[subject]} was not given: nothing was done",
+            f"consent to {_NAMES[subject]} was not given: {_NOTHING[subject]}",
             hint="run the command again and answer y, when all that is shown above is right",
         )
     return Consent(subject, "prompt", text)
@@ -156,3 +156,4 @@ def _lacking(missing: list[str], serial: int) -> str:
 
 
 _NAMES: dict[Subject, str] = {"motion": "move the machine", "writing": "write to the drive"}
+_NOTHING: dict[Subject, str] = {"motion": "nothing was moved", "writing": "nothing was written"}

@@ -26,7 +26,7 @@ EXIT_CODES: dict[ExitCode, str] = {
     ExitCode.DRIVE: "the drive is in fault, or refused a value (SDO abort)",
     ExitCode.SAFETY: "refused by a safety limit before anything moved",
     ExitCode.NOT_TRUSTWORTHY: "the measurement is not trustworthy, so no number is given (help refusals)",
-    ExitCode.DECLINED: "declined at a prompt, or no terminal; nothing was done",
+    ExitCode.DECLINED: "declined at a prompt, or no terminal; what was asked about was not done",
     ExitCode.STOP_NOT_CONFIRMED: "STOP NOT CONFIRMED: the machine may be energised, use the hardware stop",
     ExitCode.NOT_AVAILABLE: "this drive cannot give that; what is missing is named",
     ExitCode.PARTIAL: "partial: what ran is good, but something asked for could not be had; it is named",

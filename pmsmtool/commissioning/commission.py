@@ -328,6 +328,12 @@ class Commissioning:
             quick_stop(self.drive.node)
 
 
+def has_measured(run: RunDirectory) -> bool:
+    """Return whether a run holds what is worth keeping: a trace, or an identification that ended by itself."""
+    identified = run.read().stage("identify")
+    return (identified is not None and identified.status in SETTLED) or any(run.path.glob("traces/*"))
+
+
 def required_of(record: RunRecord, more: Sequence[str] = ()) -> tuple[str, ...]:
     """Return the stages a run must have: those it was begun with, and more."""
     return tuple(dict.fromkeys((*record.request.get("require", ()), *more)))

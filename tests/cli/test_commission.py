@@ -25,7 +25,7 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.cli import consent
 from pmsmtool.cli.commission import _kept_nameplate
 from pmsmtool.commissioning import commission
-from pmsmtool.commissioning.commission import STAGES
+from pmsmtool.commissioning.commission import STAGES, has_measured
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, reference_map
@@ -36,7 +36,7 @@ from pmsmtool.identification.run_files import NAMEPLATE
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.report.verdict import NEEDED
 from pmsmtool.resources import data_folder
-from pmsmtool.run_directory import RunDirectory, RunRecord, Stage, new_record
+from pmsmtool.run_directory import RunDirectory, RunRecord, Stage, Status, new_record
 from pmsmtool.sim.bus import PmsmSimBus
 from tests.cli.conftest import Tool
 from tests.drive.served import serving
@@ -268,6 +268,17 @@ def test_each_consent_is_asked_and_each_can_be_declined(
         record = RunDirectory(Path("run")).read()
         assert (record.stages[-1].name, record.stages[-1].status) == ("flash", "refused")
         assert "current.K_p_d_v_per_a" in err and "objects change" in err
+
+
+@pytest.mark.parametrize(("status", "kept"), [("partial", True), ("not available", True), ("refused", False)])
+def test_a_declined_run_is_removed_only_where_nothing_was_measured(status: Status, kept: bool, tool: Tool) -> None:
+    """A mapped drive ends its identification with partial: to decline the writing removed its run."""
+    run = identified(Path("run"))
+    run.add(Stage("identify", status, 9.0))
+    assert has_measured(run) is kept
+    (run.path / "traces").mkdir()
+    run.save("traces/torque_push_0.npz", b"")
+    assert has_measured(run)
 
 
 # ---- bad input and bad drives ------------------------------------------------------------------------------

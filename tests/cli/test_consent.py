@@ -133,8 +133,8 @@ def test_without_a_serial_number_only_a_person_consents(monkeypatch: pytest.Monk
     """--serial 0 matches what such a drive tells, and any other such drive, too."""
     monkeypatch.setattr(consent, "person_present", lambda: False)
     given = MotionOptions(yes=True, i_max_apk=5.0, speed_max_rad_s=10.0, shaft="free", serial=0)
-    for ask in (consent.ask_motion, consent.ask_writing):
-        with pytest.raises(Declined, match="nothing was done") as caught:
+    for ask, done in ((consent.ask_motion, "moved"), (consent.ask_writing, "written")):
+        with pytest.raises(Declined, match=f"nothing was {done}") as caught:
             ask(["i_max 5 A"], given, simulated=False, serial=0, out=Output())
         assert "shows no serial number" in caught.value.hint
         assert ask(["i_max 5 A"], given, simulated=True, serial=0, out=Output()).answer == "--yes"

@@ -347,7 +347,7 @@ def test_restore_without_a_journal(tool: Tool) -> None:
 
 def test_nobody_to_ask_writes_nothing(tool: Tool, wanted: str, tmp_path: Path) -> None:
     code, _, err = tool("flash-params", wanted)
-    assert code == 7 and "nothing was done" in err and "motor.R_s_ohm" in err
+    assert code == 7 and "nothing was written" in err and "motor.R_s_ohm" in err
     assert not (tmp_path / "home").exists(), "not even a journal"
     assert tool("verify", wanted)[0] == 1
 
