@@ -79,7 +79,7 @@ class _AllMissingAtOnce(click.Command):
 @click.option("--l-d", "L_d_h", type=Quantity("inductance"), help="d inductance (the smaller line-line reading).")
 @click.option("--l-q", "L_q_h", type=Quantity("inductance"), help="q inductance (the larger line-line reading).")
 @click.option("--l-between", "L_between", type=_BETWEEN, default="line-line", help="Where they are measured.")
-@click.option("--ke", help="Back-EMF constant: 58Vrms/krpm, 0.39Vpks/rad, 190rpm/Vpk, '285rpm/V block', or 0.41Wb.")
+@click.option("--ke", help="Back-EMF constant: 58Vrms/krpm, 0.39Vpks/rad, 190rpm/Vpk, '251rpm/V block', or 0.41Wb.")
 @click.option("--ke-between", type=_BETWEEN, help="Where the back-EMF is measured.")
 @click.option("--kt", help="Torque constant: 1.74Nm/Arms, 85mNm/Apk, '38mNm/A block'.")
 @click.option("--i-nom", "I_nom_apk", type=_LINE_CURRENT, help="Rated line current, e.g. 19.8Arms, '9A block'.")

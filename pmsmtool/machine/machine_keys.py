@@ -76,7 +76,7 @@ INVERTER_KEYS: tuple[Key, ...] = (
         0.1,
         0.6366198,
         1 / math.sqrt(3.0),
-        "V_max / U_dc; above 0.5774: overmodulation, needs the last three here",
+        "V_max / U_dc; above 0.5774: overmodulation, needs min_off_time_s, sample_window_s, shunts",
     ),
     _key("inverter", "V_dead_v", "V", 0, 1e3, None, "plateau of the voltage error of one phase"),
     _key("inverter", "i_knee_apk", "A", 1e-4, 1e4, None, "current at which it reaches its plateau"),
