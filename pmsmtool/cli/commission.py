@@ -200,8 +200,9 @@ def _kept_nameplate(run: RunDirectory) -> Path | None:
     from pmsmtool.commissioning.commission import GIVEN
     from pmsmtool.identification.run_files import NAMEPLATE
 
-    path = run.path / NAMEPLATE
-    return path if run.read().request.get(GIVEN, True) and path.is_file() else None
+    path, record = run.path / NAMEPLATE, run.read()
+    given = record.request.get(GIVEN, "identify" not in record.command)  # `identify` takes no machine file
+    return path if given and path.is_file() else None
 
 
 def _limits_as_begun(motion: MotionOptions, run: RunDirectory) -> MotionOptions:

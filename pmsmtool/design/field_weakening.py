@@ -39,6 +39,8 @@ ITERATIONS = 8
 """Steps per call: a warm start on a ramp needs a median of 1 and rarely more than 8."""
 
 STANDSTILL_V = 1e9
+ROUNDING = 1e-9
+"""Share of the rated current below which i_d of least current is rounding: 6e-17 without saliency."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +125,8 @@ def loss_minimising_i_d(source: MachineFile, rated: Ratings) -> float:
     """Return i_d (A) of least current at rated current; positive where L_d > L_q."""
     machine = at_temperature(source.machine, source.flux_map)
     top = torque_limits(machine, [0.0], [STANDSTILL_V], rated.I_nom_apk, rated.i_d_min_a)
-    return float(top.largest_i_d_a[0, 0])
+    i_d = float(top.largest_i_d_a[0, 0])
+    return i_d if abs(i_d) > ROUNDING * rated.I_nom_apk else 0.0  # without saliency
 
 
 def torque_constant(machine: MachineParameters, i_d_a: float) -> float:

@@ -180,6 +180,14 @@ def test_torque_constant_is_the_slope_of_the_torque() -> None:
         assert torque_constant(MTPV_MACHINE, i_d) == pytest.approx(float(slope), rel=1e-12)
 
 
+def test_a_machine_without_saliency_has_no_d_current_of_least_current() -> None:
+    """It was 4e-16 A, and a difference to what the drive holds."""
+    source = load_machine_file(PROFILES / "jercic-2017.toml")
+    for L_h in (1.875e-4, 1e-3, 2.3e-3):
+        machine = replace(source.machine, L_d_h=L_h, L_q_h=L_h, L_d_app_h=None, L_q_app_h=None)
+        assert tune(replace(source, machine=machine))["field_weakening.i_d_lm_a"] == 0.0
+
+
 def test_field_weakening_numbers_of_the_reference_machine() -> None:
     design = tune(load_machine_file(PROFILES / "jercic-2017.toml"))
     assert design["field_weakening.mode"] == 3.0
