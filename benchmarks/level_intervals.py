@@ -10,7 +10,8 @@ Drives follow from their seeds (``random_drives.py``). The simulated node has th
 ``drive=cia402`` with the master's commutation angle, or the reference drive without excitation (``level=recorder``) or
 averages (``level=inject``). ``supply``: R of the standard level from the readings of the simulated bench supply
 (``sim/channel.py``). ``--speed`` is the largest speed that is allowed, over the nameplate's: the flux linkage of
-the standard level needs one at which the voltage ends. ``--no-machine``: no machine file tells that level the inverter.
+the standard level needs one at which the voltage is at its limit. ``--no-machine``: no machine file tells that level
+the inverter.
 Every estimate is printed on stderr as error and half width (relative, or in deg); with ``--record FILE`` it goes there
 too, and a second run goes on behind it.
 

@@ -96,7 +96,8 @@ class LevelStages:
             return []
         drive_map, level = self.found.drive_map, self.found.level
         known = self.known()
-        lines = [f"capability level {level}, map {drive_map.name}: {len(drive_map.cells)} parameters"]
+        count = len(drive_map.cells)
+        lines = [f"capability level {level}, map {drive_map.name}: {count} parameter{'s' * (count != 1)}"]
         lines.append("identify: " + ("; ".join(self._measurable()) or f"not available: {self._nothing()}"))
         rest = "what is measured"
         if known is not None:

@@ -82,7 +82,7 @@ class Envelope:
             gain = (
                 f"until then full torque adds up to {float(f'{gained:.3g}'):g} rpm"
                 if rpm + gained < reached
-                else f"until then full torque may reach {float(f'{reached:.3g}'):g} rpm, where the voltage ends it"
+                else f"until then full torque may reach {float(f'{reached:.3g}'):g} rpm, where the voltage limits it"
             )
         travel = "not limited" if math.isinf(self.travel_rad) else f"{math.degrees(self.travel_rad):.4g} deg (mech)"
         energy = "not limited" if math.isinf(self.energy_j) else f"{self.energy_j:.4g} J"

@@ -508,7 +508,7 @@ def test_the_voltage_ends_what_a_failure_adds_in_speed() -> None:
     speed = voltage_speed(known, 1.414)
     assert speed == pytest.approx(33.614 / (4.0 * (9.208e-3 - 0.3447e-3)), rel=1e-3)
     light = replace(ENVELOPE, acceleration_rad_s2=24_000.0, voltage_speed_rad_s=speed)
-    assert light.lines()[5].endswith("until then full torque may reach 9050 rpm, where the voltage ends it")
+    assert light.lines()[5].endswith("until then full torque may reach 9050 rpm, where the voltage limits it")
     assert "adds up to" in replace(light, acceleration_rad_s2=10.0).lines()[5]
     fast = replace(light, speed_max_rad_s=2.0 * speed)
     assert "may reach 18100 rpm" in fast.lines()[5], "a shaft that is allowed more is not stopped by its voltage"

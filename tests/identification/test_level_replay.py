@@ -139,7 +139,7 @@ def test_a_run_without_a_machine_file_is_replayed_from_the_command_line(tmp_path
     """Slow on purpose: the voltage limit is not reached, and what it needs is said with numbers."""
     run, stage = measured("&drive=cia402", tmp_path, ASKED, speed_max_rad_s=60.0)
     assert not (run.path / MACHINE).exists()
-    needed = "up to 561 rpm it did not: allow a larger --speed-max"
+    needed = "up to 561 rpm it was not: allow a larger --speed-max"
     assert any(needed in line for line in stage.fallbacks) and needed in stage.summary
     outcome = CliRunner().invoke(cli, ["--json", "identify", "--replay", str(run.path)])
     assert isinstance(outcome.exception, Partial) and "run.json" in outcome.exception.hint
@@ -160,7 +160,7 @@ def test_a_run_without_a_machine_file_is_replayed_from_the_command_line(tmp_path
 def test_what_the_flux_linkage_needs_is_a_speed_in_numbers() -> None:
     facts = PulseFacts(Method.STANDARD, pole_pairs=3, pushed=True, voltage="link", top_rpm=1000.0, U_dc_v=540.0)
     text = below_voltage(facts, 0.5, 0.5)
-    assert "up to 1000 rpm it did not" in text and "it ends at about 1719 rpm with 540 V" in text  # 540 / 2 / 0.5 / 3
+    assert "up to 1000 rpm it was not" in text and "that is at about 1719 rpm with 540 V" in text  # 540 / 2 / 0.5 / 3
     assert "given flux linkage" not in below_voltage(facts, 0.5, 0.0)
 
 
