@@ -47,7 +47,8 @@ def require_browser() -> str:
     if browser is None:
         raise ConfigError(
             "no browser was found to make a PDF", where=os.environ.get(BROWSER, ""),
-            likely="Chromium, Chrome and Edge are looked for", hint=f"install one, or name it in {BROWSER}; {_WITHOUT}",
+            likely="neither Chromium nor Chrome nor Edge is installed where programs are looked for",
+            hint=f"install one, or name it in {BROWSER}; {_WITHOUT}",
         )  # fmt: skip
     return browser
 

@@ -219,7 +219,7 @@ def parse_emf_constant(text: str, between: Between | None) -> EmfConstant:
             raise ConfigError(f"{text!r} is a direct voltage between two terminals", hint="leave the other word out")
         return EmfConstant(value, "block", "line-line", False, text)
     if between is None:
-        where_said = f"add line-line or phase{_OR_BLOCK}"
+        where_said = f"add line-line or phase (--ke-between){_OR_BLOCK}"
         raise ConfigError(f"{text!r} does not say where the voltage is measured", hint=where_said)
     return EmfConstant(value, _kind(written, text), between, False, text)
 
