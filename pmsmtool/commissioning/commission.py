@@ -249,6 +249,14 @@ class Commissioning:
                 likely="drives were swapped, or this is the run of another drive",
                 hint="begin a new run for this drive; nothing was moved and nothing written",
             )
+        begun, used = record.drive.get("map", ""), self.drive.node.map.name
+        if begun not in ("", used):
+            raise ConfigError(
+                f"the run was begun with the drive map {begun!r}, and now {used!r} is used",
+                where=str(self.run.path),
+                likely="--map was given then, and is not now",
+                hint="give the same --map, or begin a new run; nothing was moved and nothing written",
+            )
 
     def _carry_out(self, name: str, number: int) -> None:
         clock = self.drive.node.connection.clock

@@ -240,6 +240,9 @@ def test_a_resumed_run_keeps_its_limits_and_its_machine(tool: Tool) -> None:
     record = run.read()
     run.write(replace(record, request={}, command=("pmsmtool", "identify", "R")))
     assert _kept_nameplate(run) is None, "`identify` is given no machine file"
+    run.write(replace(record, drive={**record.drive, "map": "mine"}))
+    code, _, err = tool("commission", *channel, "--resume", str(run.path))
+    assert code == 2 and "begun with the drive map 'mine', and now 'pmsmsim' is used" in err
     run.write(record)
     err = tool("commission", *channel, "--resume", str(run.path), "--i-max", "2Apk")[2]
     assert "current   at most 2 Apk" in err and "speed     at most 382 rpm" in err
