@@ -28,8 +28,9 @@ MAP_INTERVALS = "flux_map_intervals.npz"
 HELD_FALLBACK = "psi_f of the drive's parameter set: a held rotor shows increments of flux only"
 CORRECTION_STD = 0.2
 """Standard deviation of what the map takes psi_f back to zero current by, of that correction: its curvature there."""
-DEVIATION_LIMIT = 0.003
-"""Largest rms deviation of all fluxes within the map's current, of their range."""
+DEVIATION_LIMIT = 0.01
+"""Largest rms deviation of all fluxes within the map's current, of their range: a rotor that stood at one angle leaves
+0.6 % for its slots, and of 36 maps of saturated machines none had more than 0.9 %."""
 
 
 def flux_map_of(

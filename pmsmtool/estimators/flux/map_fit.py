@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """A flux map from voltage pulses: co-energy spline regression (docs/identification.md, 3.3).
 
-One linear least squares for all spline coefficients, R, the inverter's plateau and the delay of the current sample. A
-coarse pass gives the inverse incremental inductance that weights the fine one: it turns flux residuals into current
-residuals of the measured noise. Symmetry in i_q and reciprocity are tested on freer models, never assumed.
+One linear least squares for all spline coefficients, R, the inverter's plateau, iron loss and the delay of the current
+sample. A coarse pass gives the inverse incremental inductance that weights the fine one: it turns flux residuals into
+current residuals of the measured noise. Symmetry in i_q and reciprocity are tested on freer models, never assumed.
 """
 
 from __future__ import annotations
@@ -17,15 +17,18 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
 from pmsmtool.estimators.flux.map_rows import (
+    IRON_PERIODS,
     KNEES,
     NUISANCES,
     Frame,
     NormalEquations,
     PulseIntegrals,
     Whitener,
+    correlation,
     integrate_pulses,
     normal_equations,
 )
+from pmsmtool.estimators.injection.angle_dependence import HARMONICS
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
 
@@ -58,6 +61,8 @@ RAMP_STD = 0.3
 """Standard deviation of each further shape of the error, of the measured plateau."""
 DELAY_STD_SHARE = 0.1
 """Standard deviation of the delay of the current sample, of the control period."""
+IRON_STD_SHARE = 0.5
+"""Standard deviation of what flows in each branch of iron loss, per volt and by the mean inductance, likewise."""
 ANCHOR = 1e4
 """Weight of the flux at zero current, of the mean diagonal: the run over speeds knows it, the motion under pulses
 hardly does; its deviation is added to the result's."""
@@ -100,7 +105,7 @@ class CoenergyFit:
     c : ndarray, shape (k,)
         Coefficients.
     covariance : ndarray, shape (k, k)
-        Of the coefficients, widened by the residual.
+        Of the coefficients, widened by the residual and by how much neighbouring residuals say the same.
     delay_s : float
         Delay of the current sample that fits (s).
     sigma_a : float
@@ -123,6 +128,8 @@ class CoenergyFit:
         Standard deviation of the flux at zero current (Wb).
     unphysical_wb : float
         Rms of what the pulses show and no machine has (Wb), as a deviation of every flux.
+    unseen : float
+        Relative deviation of the inductances that the angles of the pulses leave of their mean over all angles.
     """
 
     spline: CoenergySpline
@@ -139,6 +146,7 @@ class CoenergyFit:
     frame: Frame
     magnet_std_wb: float
     unphysical_wb: float = 0.0
+    unseen: float = 0.0
 
     def flux(self, i_d_a: Array, i_q_a: Array) -> Array:
         """Return psi_d, psi_q (Wb), shape (2, n)."""
@@ -159,6 +167,7 @@ class CoenergyFit:
         L_dd, L_dq, L_qq = self.inductance(i_d_a, i_q_a)
         misfit = self.misfit_a * np.stack([np.hypot(L_dd, L_dq), np.hypot(L_dq, L_qq)])
         apart = self.unphysical_wb**2 + np.array([[self.magnet_std_wb], [0.0]]) ** 2
+        apart = apart + (self.unseen * (self.flux(i_d_a, i_q_a) - self.flux(np.zeros(1), np.zeros(1)))) ** 2
         return np.asarray(np.sqrt(fitted**2 + misfit**2 + apart))
 
     def inductance_std(self, i_d_a: Array, i_q_a: Array) -> Array:
@@ -172,7 +181,8 @@ class CoenergyFit:
         misfit_d, misfit_q = self.misfit_a * np.hypot(L_dd, L_dq), self.misfit_a * np.hypot(L_dq, L_qq)
         h_d, h_q = _spacing(self.spline.breaks_d, i_d_a), _spacing(self.spline.breaks_q, i_q_a)
         misfit = np.stack([misfit_d / h_d, np.sqrt(misfit_d * misfit_q / (h_d * h_q)), misfit_q / h_q])
-        return np.asarray(np.hypot(fitted, misfit))
+        unseen = self.unseen * np.stack([L_dd, np.sqrt(np.abs(L_dd * L_qq)), L_qq])
+        return np.asarray(np.sqrt(fitted**2 + misfit**2 + unseen**2))
 
     def _std(self, i_d_a: Array, i_q_a: Array, by_d: int, by_q: int) -> Array:
         rows = self.spline.derivative(i_d_a, i_q_a, by_d, by_q)
@@ -241,11 +251,11 @@ def fit_coenergy(
         Turn the frame onto the axis of symmetry: where the offset of the encoder is not known better.
     """
     T_s = float(traces[0].meta["control_period_s"])
-    ramps = np.zeros(len(KNEES))
     plateau = float(np.max(np.abs(curve.u_error_v)))
+    ramps, iron = [RAMP_STD * plateau + 1e-9] * len(KNEES), [IRON_STD_SHARE * T_s] * len(IRON_PERIODS)
     priors = Priors(
-        (R_ohm, 1.0, *ramps, 0.0),
-        (R_STD * R_ohm, INVERTER_STD, *(ramps + RAMP_STD * plateau + 1e-9), DELAY_STD_SHARE * T_s),
+        (R_ohm, 1.0, *([0.0] * (len(NUISANCES) - 2))),
+        (R_STD * R_ohm, INVERTER_STD, *ramps, *iron, DELAY_STD_SHARE * T_s),
     )
     for _ in range(ALIGNMENTS if align else 1):
         pulses = [integrate_pulses(trace, frame, curve, R_ohm) for trace in traces]
@@ -274,6 +284,8 @@ def _fine_fit(
     k, own = spline.size, spline.size + len(NUISANCES)
     sums = NormalEquations(with_skew.A[:own, :own], with_skew.b[:own], with_skew.c, with_skew.n)
     unit = _unit(sums, spline, priors, magnet, sigma_a)
+    x, _ = _solve(sums, spline, priors, magnet, unit)
+    unit *= math.sqrt(correlation(pulses, spline, whiten, x))
     x, covariance = _solve(sums, spline, priors, magnet, unit)
     asymmetry, asymmetry_std, axis = _symmetry(spline, x, covariance, i)
     symmetric = asymmetry <= max(SYMMETRIC_SIGMA * asymmetry_std, SYMMETRIC_SHARE * _span(spline, x, i))
@@ -288,8 +300,14 @@ def _fine_fit(
     return CoenergyFit(
         spline, x[:k], covariance[:k, :k], float(x[own - 1]), sigma_a,
         sums.squares(x) / (sigma_a**2 * (sums.n - len(x))), sums.n, symmetric, asymmetry, axis,
-        FittedSkew(free[:k], skew, free[own:]), frame, magnet.std_wb,
+        FittedSkew(free[:k], skew, free[own:]), frame, magnet.std_wb, unseen=_unseen(pulses),
     )  # fmt: skip
+
+
+def _unseen(pulses: Sequence[PulseIntegrals]) -> float:
+    """Return the relative deviation of L that the angles of the pulses leave of its mean over all angles."""
+    theta = np.concatenate([p.theta for p in pulses])
+    return math.sqrt(sum((std * abs(np.mean(np.exp(1j * m * theta)))) ** 2 for m, std in HARMONICS.items()))
 
 
 def _flat(pulses: Sequence[PulseIntegrals]) -> Whitener:

@@ -2,16 +2,16 @@
 """From pulse traces to the linear equations of a flux map (docs/identification.md, 3.3).
 
 The flux in the stator frame is an integral of what is known, psi_ab(t_n) = psi_ab(t_0) + integral of u - R i - e, and
-psi_dq(i) = R(-theta_n) psi_ab(t_n) is linear in the spline coefficients, in R, in the plateau of the inverter's error
-and in a small delay of the current sample. Integration in the stator frame makes the motion of a free rotor exact and
-shows the magnet's flux as far as the rotor turned; the constant of each short segment is projected out, so nothing
-drifts.
+psi_dq(i) = R(-theta_n) psi_ab(t_n) is linear in the spline coefficients, in R, in the plateau of the inverter's error,
+in currents of iron loss and in a small delay of the current sample. Integration in the stator frame makes the motion of
+a free rotor exact and shows the magnet's flux as far as the rotor turned; constant and slope of each short segment are
+projected out: nothing drifts, and a voltage that is off (legs, offsets, the inverter's error at rest) is no flux.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,8 +22,10 @@ from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.trace import Trace
 
 SEGMENT = 150
-"""Samples that share one constant: long enough for a pulse, short enough for what R and inverter leave to add up."""
+"""Samples that share their constants: long enough for a pulse, short enough for what R and inverter leave to add up."""
 SEGMENT_LEAST = 40
+CONSTANTS = 4
+"""Of a segment: its flux and a voltage that does not change, by two axes."""
 GAUSS = (0.5 - 0.5 / math.sqrt(3.0), 0.5 + 0.5 / math.sqrt(3.0))
 """Points of an interval at which the inverter's error is averaged."""
 STEPS_LEFT = 0.6
@@ -33,7 +35,11 @@ ROUNDING = 1e-6
 KNEES = (0.5, 1.0, 2.0)
 """Further shapes of the inverter's error, a ramp to a plateau each: knees in steps of the current between two samples.
 A fast current, with the ripple of a high duty ratio, rounds the curve that was measured at rest."""
-NUISANCES = ("R_ohm", "inverter", *(f"ramp_{knee:g}_v" for knee in KNEES), "delay_s")
+IRON_PERIODS = (0.0, 2.0)
+"""Time constants of branches of iron loss (control periods): what flows in them is in the current and makes no flux."""
+NUISANCES = (
+    "R_ohm", "inverter", *(f"ramp_{knee:g}_v" for knee in KNEES), *(f"iron_{n:g}_s" for n in IRON_PERIODS), "delay_s"
+)  # fmt: skip
 """Columns behind the spline coefficients."""
 
 
@@ -252,17 +258,39 @@ def normal_equations(
     """
     size = spline.size + len(NUISANCES) + (0 if skew is None else skew.size)
     sums = NormalEquations.empty(size)
+    for rows, target in _segments(traces, spline, whiten, skew):
+        sums.add(rows, target)
+        sums.n += len(target) - CONSTANTS
+    return sums
+
+
+def correlation(traces: Sequence[PulseIntegrals], spline: CoenergySpline, whiten: Whitener, x: Array) -> float:
+    """Return how many neighbouring residuals at a solution say the same: one where they are noise alone."""
+    sums = np.zeros(SEGMENT)
+    for rows, target in _segments(traces, spline, whiten, None):
+        left = (target - rows @ x).reshape(-1, 2)
+        for apart in range(min(SEGMENT, len(left))):
+            sums[apart] += float(np.sum(left[apart:] * left[: len(left) - apart]))
+    falling = sums / sums[0]
+    end = int(np.argmax(falling <= 0.0))
+    return 1.0 + 2.0 * float(np.sum(falling[1:end]))
+
+
+def _segments(
+    traces: Sequence[PulseIntegrals], spline: CoenergySpline, whiten: Whitener, skew: CoenergySpline | None
+) -> Iterator[tuple[Array, Array]]:
+    """Yield rows (n, k) and targets (n,) of each segment without its constants."""
     for trace in traces:
         rows, target, constants = _rows(trace, spline, whiten, skew)
         for start in range(trace.first, len(trace.theta), SEGMENT):
             part = slice(start, min(start + SEGMENT, len(trace.theta)))
-            if part.stop - part.start < SEGMENT_LEAST:
+            n = part.stop - part.start
+            if n < SEGMENT_LEAST:
                 continue
-            x, y = rows[part].reshape(-1, size), target[part].ravel()
-            q, _ = np.linalg.qr(constants[part].reshape(-1, 2))
-            sums.add(x - q @ (q.T @ x), y - q @ (q.T @ y))
-            sums.n += len(y) - 2
-    return sums
+            x, y = rows[part].reshape(2 * n, -1), target[part].ravel()
+            level = constants[part]
+            q, _ = np.linalg.qr(np.concatenate([level, np.arange(n)[:, None, None] * level], axis=2).reshape(2 * n, -1))
+            yield x - q @ (q.T @ x), y - q @ (q.T @ y)
 
 
 def _rows(
@@ -274,10 +302,12 @@ def _rows(
         return turn(-trace.theta, vector).T
 
     i_d, i_q = trace.i
+    w = whiten(trace.i)
     parts = [
         np.stack([spline.derivative(i_d, i_q, 1, 0), spline.derivative(i_d, i_q, 0, 1)], axis=1),
         seen(trace.current_seconds)[:, :, None],
         *(seen(error)[:, :, None] for error in trace.error_seconds),
+        _iron_columns(trace, w),
         seen(trace.volts_before)[:, :, None],
     ]
     if skew is not None:
@@ -285,7 +315,6 @@ def _rows(
         parts.append(np.stack([field, np.zeros_like(field)], axis=1))
     c, s = np.cos(trace.theta), np.sin(trace.theta)
     constants = np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)
-    w = whiten(trace.i)
 
     def weighted(x: Array) -> Array:
         # two products of the wide array instead of thousands of small matrix products
@@ -293,3 +322,15 @@ def _rows(
 
     rows, target = weighted(np.concatenate(parts, axis=2)), weighted(seen(trace.volt_seconds)[:, :, None])
     return rows, target[:, :, 0], weighted(constants)
+
+
+def _iron_columns(trace: PulseIntegrals, w: Array) -> Array:
+    """Flux (n, 2, k) of the currents of iron loss: of one ampere per volt, in seconds by the mean inductance."""
+    columns = []
+    for periods in IRON_PERIODS:
+        fade = math.exp(-1.0 / periods) if periods else 0.0
+        kernel = (1.0 - fade) * fade ** np.arange(1.0 + round(8.0 * periods))
+        volts = np.stack([np.convolve(u, kernel)[: len(trace.theta)] for u in trace.volts_before])
+        columns.append(turn(-trace.theta, volts).T)
+    mean = float(np.mean(np.diagonal(w, axis1=1, axis2=2)))
+    return np.asarray(np.linalg.solve(w, mean * np.stack(columns, axis=2)))
