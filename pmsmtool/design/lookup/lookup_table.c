@@ -15,6 +15,7 @@
 
 #define BINDING 1e-5         /* a limit binds within this, relative */
 #define FULL_VOLTAGE 1e-12   /* a node at the limit counts as inside, relative; the stored point is exact to 1e-13 */
+#define NEARLY_FULL 0.02     /* squared voltage above the limit that a measured map may feign, relative */
 #define NEWTON_STEPS 12
 #define NEWTON_DONE 4e-15    /* residual of torque and voltage, relative */
 #define SAME_TORQUE 1e-10    /* torques that are one, relative to the range of a speed */
@@ -223,12 +224,15 @@ static int32_t solve_cell(pmsm_contour *c, const pmsm_plane *plane, double omega
 }
 
 /* On an oddly saturated machine the contour may leave the domain and come back, or flux and current may rise and fall
- * again. Torque has no extreme inside, so every part of a contour ends on the border: all of them, from there. */
+ * again. Torque has no extreme inside, so every part of a contour ends on the border: all of them, from there. Where
+ * fluxes waver, torques between two that the voltage allows may need a little more of it: the point of the least. */
 static int32_t solve_everywhere(const pmsm_contours *all, double T, double omega, double V, pmsm_point *at)
 {
     pmsm_contour c;
+    pmsm_point nearest;
     demand want = {all->plane, omega, V * V, all->plane->R * all->plane->R, omega * omega, 0.0};
-    int32_t have = 0;
+    double over = NEARLY_FULL * want.V2;
+    int32_t have = 0, nearly = 0;
     want.room = want.V2 - 2.0 * all->plane->R * omega * T;
     c.curve = (pmsm_curve){all->plane, &all->border.rectangle, PMSM_CURVE_TORQUE, T, omega, V * V, T};
     for (int32_t p = 0; p < all->border.n_pieces; p++) {
@@ -249,6 +253,12 @@ static int32_t solve_everywhere(const pmsm_contours *all, double T, double omega
                     consider(&best, &c.start);
                 for (int32_t n = 1; n < on->n; n++)
                     least_between(&want, &c.curve, &on->at[n - 1], &on->at[n], &best);
+                for (int32_t n = 0; n < on->n; n++)
+                    if (excess(&want, &on->at[n]) < over && pmsm_on_branch(all->plane, &on->at[n])) {
+                        over = excess(&want, &on->at[n]);
+                        nearest = on->at[n];
+                        nearly = 1;
+                    }
                 if (best.have && pmsm_on_branch(all->plane, &best.at) && (!have || best.at.h < at->h)) {
                     *at = best.at;
                     have = 1;
@@ -256,7 +266,9 @@ static int32_t solve_everywhere(const pmsm_contours *all, double T, double omega
             }
         }
     }
-    return have;
+    if (!have && nearly)
+        *at = nearest;
+    return have || nearly;
 }
 
 static uint8_t touched(const pmsm_contours *all, const pmsm_point *at, double omega, double V)
