@@ -35,6 +35,7 @@ from pmsmtool.estimators.resistance import (
     estimate_resistance,
     resistance_warmed,
     settled_levels,
+    warming,
 )
 from pmsmtool.estimators.sensor_mismatch import SensorMismatch, estimate_mismatch, widened, without_mismatch
 from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
@@ -371,8 +372,9 @@ def resistance_of(
     plateau_v: float = 0.0,
 ) -> ResistanceResult:
     """Return the resistance at a reference temperature; levels at which the shaft moved are left out, and counted."""
-    levels, left_out = settled_levels(levels, noise)
-    result = estimate_resistance(levels, noise, tolerance=tolerance, copper=copper, plateau_v=plateau_v)
+    settled, left_out = settled_levels(levels, noise)
+    result = estimate_resistance(settled, noise, tolerance=tolerance, copper=copper, plateau_v=plateau_v)
+    result = replace(result, warming_k_per_a2s=warming(levels))
     if not left_out:
         return result
     note = f"{counted(left_out, 'level')} left out: shaft or voltage moved then"

@@ -28,6 +28,7 @@ from pmsmtool.identification.verdicts import NOT_ACCEPTED, STEP, Verdicts, verdi
 from pmsmtool.identification.wiring import SUPPLY, WRONG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.temperature import WARMING
 from pmsmtool.machine.two_masses import INERTIA, REFUSED, SWING, TORQUE_NOISE, UNSEEN
 from pmsmtool.run_directory import Acceptance, Stage
 from pmsmtool.units import format_estimate
@@ -230,6 +231,7 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions |= {"cogging_nm": evaluation.cogging.J.value * largest.amplitude, "cogging_periods": largest.order}
     if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
         conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
+        conditions[WARMING] = evaluation.resistance.warming_k_per_a2s
     return conditions
 
 

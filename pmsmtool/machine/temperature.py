@@ -24,6 +24,8 @@ ASSUMED_MAGNET_PER_K = 0.0009
 """95 % half width of that assumption: from samarium-cobalt, -0.03 %/K, to ferrite, -0.2 %/K."""
 WINDING_TOLERANCE = 0.10
 """Relative 95 % half width of a winding's resistance that a file states without a deviation: a data sheet's."""
+WARMING = "winding_k_per_a2s"
+"""Of a machine file's conditions: what the winding warms by per square of a current (A peak) and time (K/(A2 s))."""
 UNKNOWN_T_RANGE_C = (5.0, 90.0)
 """Winding and magnets of a machine whose temperature nothing tells (degC)."""
 

@@ -15,7 +15,7 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.drive.port import Drive, Injection
 from pmsmtool.errors import CheckFailed
 from pmsmtool.experiments.speed_run import reach
-from pmsmtool.proof.plan import Conditions, Experiment, ProofPlan
+from pmsmtool.proof.plan import Conditions, Experiment, ProofPlan, room_k, warmth
 from pmsmtool.trace import Trace
 from pmsmtool.units import RAD_S_PER_RPM
 
@@ -64,6 +64,9 @@ RISE_S = 3.0
 at full torque a current limit below the design's leaves no i_q beside the i_d that the look-up tables ask for, and the
 machine stays where it is (interior-2k2 at 5 A: at 375 of 474 rad/s with i_d = -4.99 A). It is left as gently: braking
 with full torque feeds the DC link, which nobody may have made for it."""
+COOL_MOST_S, LEAST_ROOM_K = 30.0, 1.0
+"""Longest time for the sake of a warm winding, and least rise and room that count: braking a heavy shaft from 208 rpm
+in 3 s took one to its trip."""
 
 Keep = Callable[[Experiment, Trace], bool]
 """Told every record as soon as it is there; returns whether to go on."""
@@ -101,7 +104,7 @@ def run_experiments(
         if not keep(experiment, replace(trace, meta={**trace.meta, **_facts(experiment)})):
             break
     if any(e.base_rad_s for e in plan.experiments):
-        _approach(drive, 0.0, design.machine.machine.pole_pairs)
+        _approach(drive, 0.0, design)
         _come_to_rest(drive, design.machine.machine.pole_pairs)
 
 
@@ -112,7 +115,7 @@ def _recorded(
     omega_e = pole_pairs * experiment.base_rad_s
     for left in reversed(range(ATTEMPTS)):
         if experiment.base_rad_s or experiment.excitation.point is Injection.SPEED:
-            _approach(drive, experiment.base_rad_s, pole_pairs)
+            _approach(drive, experiment.base_rad_s, design)
             if not omega_e:
                 _come_to_rest(drive, pole_pairs)  # the shaft may still turn from what was done before
         if omega_e:
@@ -198,16 +201,28 @@ def _why_not(state: Mapping[str, float], limited: bool, design: Design, conditio
     return "the drive commands no more current: a speed or torque limit of its own"
 
 
-def _approach(drive: Drive, speed_rad_s: float, pole_pairs: int) -> None:
+def _approach(drive: Drive, speed_rad_s: float, design: Design) -> None:
     """Ask for a mechanical speed (rad/s) in small steps, up and down: full torque either way may be too much."""
-    present = drive.live("omega_e_rad_s") / pole_pairs
+    present = drive.live("omega_e_rad_s") / design.machine.machine.pole_pairs
     change = speed_rad_s - present
     slope = RISE_SHARE * drive.read("speed.acceleration_rpm_per_s") * RAD_S_PER_RPM
     if present >= 0.0 and slope > 0.0:
+        seconds = _cool_s(drive, change, min(abs(change) / slope, RISE_S), design)
         for k in range(1, RISE_STEPS):
             drive.command_speed(present + change * k / RISE_STEPS)
-            drive.wait(min(abs(change) / slope, RISE_S) / RISE_STEPS)
+            drive.wait(seconds / RISE_STEPS)
     drive.command_speed(speed_rad_s)
+
+
+def _cool_s(drive: Drive, change_rad_s: float, least_s: float, design: Design) -> float:
+    """Return the time over which a change of the speed leaves the winding below its trip, and no less than wanted (s).
+
+    A rise that is less than what a temperature is told from another by is none.
+    """
+    warms = warmth(design) * change_rad_s**2
+    if warms <= LEAST_ROOM_K * least_s:
+        return least_s
+    return max(least_s, min(COOL_MOST_S, warms / max(LEAST_ROOM_K, room_k(design, drive.live("T_winding_c")))))
 
 
 def _ramp_s(drive: Drive, speed_rad_s: float, pole_pairs: int) -> float:

@@ -34,6 +34,7 @@ from pmsmtool.estimators.resistance import (
     tail_models,
     two_point_slope,
     unsettled,
+    warming,
 )
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
@@ -180,6 +181,22 @@ def test_a_winding_warms_as_its_differential_equation_has_it() -> None:
                            rtol=1e-10, atol=1e-12)  # fmt: skip
         assert found[k] == pytest.approx(solved.y[0, 0], rel=1e-6)
         warm, before = float(solved.y[0, 1]), now
+
+
+WARMING_TOLERANCE = 0.06
+"""A level is an interval with one mean temperature: 4.0 % off at a level of 0.23 time constants."""
+
+
+def test_what_a_winding_warms_by_is_told_from_its_sensor() -> None:
+    """It cools meanwhile to what is around it, whose temperature nothing tells. Without a sensor it is not known."""
+    levels, k, tau_s = _levels(), 0.05, 1.1
+    T_c = np.full(len(levels), 85.0)
+    for n in range(1, len(T_c)):
+        end = 80.0 + k * tau_s * levels["i_d_a"][n] ** 2
+        T_c[n] = end + (T_c[n - 1] - end) * math.exp(-0.25 / tau_s)
+    assert warming(_levels(T_winding_c=T_c)) == pytest.approx(k, rel=WARMING_TOLERANCE)
+    assert warming(levels) == 0.0
+    assert warming(_levels(T_winding_c=np.full_like(T_c, 20.0))) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_scatter_of_the_levels_decides_between_two_floors() -> None:

@@ -21,7 +21,8 @@ from pmsmtool.identification.mechanics import PLAY_FALLBACK
 from pmsmtool.identification.sampling import INSTANT, LAG
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
-from pmsmtool.machine.torque import iron_drag
+from pmsmtool.machine.temperature import WARMING
+from pmsmtool.machine.torque import iron_drag, torque_per_ampere
 from pmsmtool.machine.two_masses import INERTIA, PLAY_FACTOR, REFUSED, SWING, TORQUE_NOISE, UNSEEN
 from pmsmtool.proof.drawn_machine import EMF_HARMONICS, FRICTION_FACTOR, LAG_SHARES, LATE_SHARE
 from pmsmtool.proof.judgement import LEAST_STEADY_ROWS
@@ -230,6 +231,23 @@ def test_a_record_of_a_speed_ends_behind_its_ramp_however_heavy_the_shaft(heavie
     if "weakening" in entries:
         corner = made.machine.inverter.V_max_v / made["motor.psi_f_wb"] / made["motor.pole_pairs"]
         assert entries["weakening"].base_rad_s + entries["weakening"].excitation.amplitude > 0.98 * corner
+
+
+def test_a_warm_winding_is_asked_for_no_speed_step_that_trips_it() -> None:
+    """A healthy drive at 105 degC, whose winding warms with 4.4 s, was tripped by its speed step at 155 degC."""
+    made = design()
+    machine, slope = made.machine.machine, made["speed.acceleration_rpm_per_s"] * RAD_S_PER_RPM
+    whole = plan_proof(made, conditions(made)).experiments[0].excitation.amplitude
+    current = (machine.J_kgm2 or 0.0) * slope / torque_per_ampere(machine.pole_pairs, machine.psi_f_wb)
+    rise_k = made["protection.T_winding_max_c"] - 95.0  # of the whole step
+    per_k = rise_k / (current**2 * whole / slope)
+    known = {**made.machine.conditions, WARMING: per_k}
+    warms = replace(made, machine=replace(made.machine, conditions=known))
+    for T_c, share in ((25.0, 1.0), (105.0, 0.8 * (1.0 - 10.0 / rise_k)), (math.nan, 1.0)):
+        step = plan_proof(warms, conditions(made, T_winding_c=T_c)).experiments[0]
+        assert step.excitation.amplitude == pytest.approx(share * whole) and ("warm" in step.text) == (share < 1.0)
+    hot = plan_proof(warms, conditions(made, T_winding_c=150.0))
+    assert hot.experiments[0].name == "q_steps" and "let it cool" in hot.left_out[0]
 
 
 def light(J_kgm2: float = 1.2e-5, psi_f_wb: float = 0.02) -> MachineFile:

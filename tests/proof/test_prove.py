@@ -37,6 +37,7 @@ from pmsmtool.flash.restore import take_backup
 from pmsmtool.identification.wiring import SUPPLY
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.temperature import WARMING
 from pmsmtool.measurement.limits import LEAST_CURRENT
 from pmsmtool.proof import measured
 from pmsmtool.proof import stage as stages
@@ -306,6 +307,19 @@ class Coasting:
 
     def wait(self, seconds: float) -> None:
         self.now_s += seconds
+
+
+def test_a_heavy_shaft_on_a_warm_winding_takes_its_time_to_a_speed() -> None:
+    """Braked from 208 rpm in 3 s, one took its winding to its trip at 155 degC."""
+    made = tune(load_machine_file(data_folder("profiles") / "interior-2k2.toml"), TuneRequest())
+    assert measured._cool_s(SimpleNamespace(), 10.0, 3.0, made) == 3.0  # type: ignore[arg-type]
+    hottest = made["protection.T_winding_max_c"]
+    warms = replace(made, machine=replace(made.machine, conditions={WARMING: 1.0}))
+    seconds = [measured._cool_s(SimpleNamespace(live=lambda _, T_c=T_c: T_c), 900.0, 0.0, warms)  # type: ignore[arg-type]
+               for T_c in (hottest - 40.0, hottest - 20.0, math.nan, hottest)]  # fmt: skip
+    assert seconds[:3] == [pytest.approx(0.5 * seconds[1]), seconds[1], 0.0]
+    assert 0.0 < seconds[1] < measured.COOL_MOST_S
+    assert seconds[3] == pytest.approx(min(measured.COOL_MOST_S, 32.0 * seconds[0]))
 
 
 def test_a_heavy_shaft_is_waited_for_until_it_rests_and_a_driven_one_is_not() -> None:
