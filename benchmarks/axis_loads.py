@@ -7,7 +7,7 @@
 
 The reference drive's firmware turns a motor with a load: resonance 50 to 800 Hz, load over motor inertia 0.2 to 20,
 damping 0.5 to 5 %, Coulomb friction 0.5 to 3 % of the rated torque, half of the loads with backlash of up to 0.1
-degree. The design knows inertia, resonance and antiresonance as `identify` leaves them, off by a draw from their
+degree. The design knows inertia, both frequencies and the damping as `identify` leaves them, off by a draw from their
 intervals. The stored gains are those of a maker's tool: crossover 60 rad/s for the whole inertia, not fed forward.
 Said are the largest following error of the designed gains over that of the stored ones, without and with ``--stored``,
 and the least margins over the tolerance box.
@@ -15,7 +15,8 @@ and the least margins over the tolerance box.
 With ``--drive FAMILY`` a simulated drive of that family does the whole job over CAN, by the commands that a person
 gives: `backup`, `tune --axis --stored`, `move`, `flash-params`, `move`. Stored are the gains of its face (crossover 60
 rad/s and 15 1/s for the whole inertia, no feed-forward). The move is of 60 degrees at half of the designed
-acceleration, at most 300 rad/s2. Said besides are how long both moves kept the drive, and why a load got no comparison.
+acceleration, at most 300 rad/s2; after `map learn` as the design gives it within the drive's own limits of current.
+Said besides are how long both moves kept the drive, and why a load got no comparison.
 
 Families whose gains have no published unit are nodes of a ``--table`` (``sim/foreign/file_rows.py``) with gains that a
 seed drew for the motor alone (``sim/foreign/drawn_gains.py``). There `map learn` comes first, on the uncoupled motor;
@@ -52,8 +53,8 @@ from pmsmtool.sim.foreign.behind import stored_gains
 from pmsmtool.sim.kernel import Simulation
 from pmsmtool.sim.simulated_machine import build_setup, settings_of
 
-STD = {"J_kgm2": 0.015, "resonance_hz": 0.005, "antiresonance_hz": 0.005}
-"""Relative standard deviation of what the design knows."""
+STD = {"J_kgm2": 0.015, "resonance_hz": 0.005, "antiresonance_hz": 0.005, "resonance_zeta": 0.05}
+"""Relative standard deviation of what the design knows; `identify frf` left 1.8 % of a damping of 0.04."""
 ENCODER_BITS = 17
 WAY_RAD, REST_S = math.pi, 0.4
 ROWS = 2000
@@ -80,9 +81,9 @@ def loaded(seed: int) -> tuple[MachineFile, MachineFile]:
         "coupling_damping_nms_per_rad": 2.0 * zeta * k / (2.0 * math.pi * f_r), "encoder_bits": ENCODER_BITS,
         "backlash_rad": float(rng.uniform(0.0, math.radians(0.1))) if rng.random() < 0.5 else 0.0,
     }  # fmt: skip
-    true = {"J_kgm2": J_M + J_L, "resonance_hz": f_r, "antiresonance_hz": f_a}
+    true = {"J_kgm2": J_M + J_L, "resonance_hz": f_r, "antiresonance_hz": f_a, "resonance_zeta": zeta}
     seen: dict[str, Any] = {name: value * (1.0 + STD[name] * rng.standard_normal()) for name, value in true.items()}
-    known = replace(motor, **seen, resonance_zeta=zeta, tau_c_nm=tau_c)
+    known = replace(motor, **seen, tau_c_nm=tau_c)
     std = {**base.std, **{name: STD[name] * value for name, value in seen.items()}}
     described = replace(base, machine=known, std=std)
     return replace(described, simulation={**base.simulation, **settings}), described
@@ -122,8 +123,8 @@ LEARNED = {
 """Map of the families of a table whose gains `map learn` must find first."""
 UNABLE = ("following error", "speed", "travel")
 """Limits that end a move which the stored gains cannot do: the shaft swings, or comes no nearer. Its ratio is 0."""
-SHARE_OF_ACCELERATION, FASTEST, CALM = 0.5, 300.0, 100.0
-"""Acceleration of the compared move: of the designed one, and its largest (rad/s2); with learned gains."""
+SHARE_OF_ACCELERATION, FASTEST = 0.5, 300.0
+"""Acceleration of the compared move: of the designed one, and its largest (rad/s2)."""
 
 
 def done(*arguments: str) -> Any:
@@ -177,10 +178,10 @@ def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float
         done("backup", "-o", "stored.json", *drive)
         made = done("tune", "known.toml", "-o", "axis.toml", "--axis", "--stored", "stored.json", "--map", used)
         acceleration = min(FASTEST, SHARE_OF_ACCELERATION * float(made["facts"]["axis_acceleration_rad_s2"]))
-        speed = "300rpm"
-        if family in LEARNED:  # the stored gains are for the motor alone
-            speed, acceleration = "40rpm", min(acceleration, CALM)
-        move = ("move", "--by", "60deg", "--speed", speed, "--acceleration", f"{acceleration:.4g}", *drive, "--yes")
+        limits = ("--speed", "300rpm", "--acceleration", f"{acceleration:.4g}")
+        if family in LEARNED:  # the stored gains are for the motor alone, and its drive may give little torque
+            limits = ("--speed", "40rpm", "--design", "axis.toml")
+        move = ("move", "--by", "60deg", *limits, *drive, "--yes")
         code, before, reason = asked(*move, "--json")
         if code != 0 and not reason.startswith(UNABLE):
             raise RuntimeError(f"move with the stored gains: exit {code}: {reason}")

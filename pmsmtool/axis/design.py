@@ -289,7 +289,7 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
         speed = stiffest(box, limits, notch=notch, loops=("speed",))
         position = stiffest(box, limits, notch=notch, loops=("position",))
     else:
-        speed = position = stiffest(box, limits, notch=notch)
+        speed = position = stiffest(box, limits, notch=notch, fed=drive.feeds(CASCADE[1]))
     profile = profile_of(design, shaft, position, path.T)
     if PROFILE[3] not in drive.offers and PROFILE[0] in drive.offers:
         notes = (*notes, "no object for the jerk (0x60A4): moves are trapezoids")

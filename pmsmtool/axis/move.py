@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
@@ -16,8 +17,11 @@ from pmsmtool.trace import Trace
 
 WINDOW = 0.01
 """Window in which the error of a move has settled, of its way."""
-RESTING = 1e-4
-"""Largest change of the demand between samples at which it rests, of the way."""
+RESTING, NEAR, NOISES = 1e-4, 0.01, 3.0
+"""Distance from an end of the move within which a demand rests, and within which its noise is looked for, of the way;
+and how much of that noise (its upper quartile) still counts as rest."""
+SAMPLES = 5
+"""Of which the middle one counts: one that is far off ends no rest."""
 LEAST_SAMPLES = 50
 INSIDE = 20
 """Last samples of a rest that are inside where an error has settled."""
@@ -75,6 +79,21 @@ def shown(value: float, unit: str) -> str:
     return f"{factor * value:.4g} {told}".strip()
 
 
+def moving(trace: Trace) -> NDArray[np.bool_]:
+    """Return where the demand of moves there and back is at neither end of them, shape (n,).
+
+    A demand that is the sum of position and following error is noisy at rest: a shaft that still swings was seen at
+    another instant than its error.
+    """
+    from scipy.ndimage import median_filter  # only after a move
+
+    demand, way = trace["theta_ref_rad"], float(trace.meta["way_rad"])
+    off = np.min(np.abs(demand - demand[0] - np.array([[0.0], [way]])), axis=0)
+    off = median_filter(off, SAMPLES, mode="nearest")
+    noise = float(np.quantile(off[off < NEAR * abs(way)], 0.75))
+    return np.asarray(off > max(RESTING * abs(way), NOISES * noise), dtype=np.bool_)
+
+
 def move_result(trace: Trace) -> MoveResult:
     """Return what a move says. Raises IdentificationError: too few samples, or the demand did not move.
 
@@ -84,30 +103,29 @@ def move_result(trace: Trace) -> MoveResult:
         As ``experiments.move.record_move`` leaves it.
     """
     way = abs(float(trace.meta["way_rad"]))
-    t, demand, error = trace.t_s, trace["theta_ref_rad"], trace["theta_ref_rad"] - trace["theta_m_rad"]
-    moving = np.abs(np.diff(demand, prepend=demand[:1])) > RESTING * way
-    if t.size < LEAST_SAMPLES or not moving.any():
+    t, error = trace.t_s, trace["theta_ref_rad"] - trace["theta_m_rad"]
+    moves = moving(trace)
+    if t.size < LEAST_SAMPLES or not moves.any():
         raise IdentificationError(
-            "E_EXCITATION", f"{t.size} samples, in {int(moving.sum())} of which the demand moved",
+            "E_EXCITATION", f"{t.size} samples, in {int(moves.sum())} of which the demand moved",
             likely="the bus is busy, or the drive did not take the set-point",
             hint="leave the bus to this program, then run the command again",
         )  # fmt: skip
-    first = int(np.argmax(moving))
+    first = int(np.argmax(moves))
     rest = float(np.median(trace["i_q_a"][:first])) if first else 0.0
-    current = trace["i_q_a"][moving] - rest
-    # a demand that rests for a sample within a move (whole counts) has not ended
-    stops = np.flatnonzero(moving[:-1] & ~moving[1:]) + 1
-    ends = [int(k) for k in stops if not moving[k : k + LEAST_SAMPLES].any()]
-    spans = [(k, next((int(m) for m in np.flatnonzero(moving[k:]) + k), t.size)) for k in ends]
+    current = trace["i_q_a"][moves] - rest
+    stops = np.flatnonzero(moves[:-1] & ~moves[1:]) + 1
+    ends = [int(k) for k in stops if not moves[k : k + LEAST_SAMPLES].any()]
+    spans = [(k, next((int(m) for m in np.flatnonzero(moves[k:]) + k), t.size)) for k in ends]
     return MoveResult(
         way_rad=way,
         error_peak_rad=float(np.max(np.abs(error[first:]))),
-        error_rms_rad=float(np.sqrt(np.mean(error[moving] ** 2))),
+        error_rms_rad=float(np.sqrt(np.mean(error[moves] ** 2))),
         settling_s=max((_settled(t[k:m], error[k:m], WINDOW * way) for k, m in spans), default=0.0),
         error_end_rad=max((float(np.mean(np.abs(error[max(k, m - 20) : m]))) for k, m in spans), default=0.0),
         current_peak_a=float(np.max(np.abs(current))),
         current_rms_a=float(np.sqrt(np.mean(current**2))),
-        moving_s=float(np.sum(np.diff(t, append=t[-1:])[moving])),
+        moving_s=float(np.sum(np.diff(t, append=t[-1:])[moves])),
         samples=int(t.size),
     )
 

@@ -16,11 +16,11 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError
 
-SHARES = np.linspace(0.0, 0.5, 51)
-"""Time of a ramp over that of the whole move: 0 is a step of the speed, 0.5 a triangle."""
-WIDTHS = np.linspace(1.0, 1.15, 31)
-"""Time of the move over that in which the demand is seen to change: its ends are softer than a count."""
-ROUNDS, NARROWER = 2, 0.12
+STARTS = (0.02, 0.1, 0.25, 0.45)
+"""Time of a ramp over that of the whole move, from which the fit of a trapezoid begins."""
+BOUNDS = (0.3, 0.0, -np.inf), (1.5, 1.0, np.inf)
+SCALES = (0.1, 0.01, 0.01)
+"""Even time, ramp and middle of a move over the time in which the demand is seen to change, and their typical sizes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,25 +126,25 @@ def trapezoid_of(t_s: Array, demand: Array) -> tuple[float, float]:
     t_s, demand : ndarray
         Times (s) and demands (rad), shape (n,), from before the move until after it; the demand must change.
     """
+    from scipy.optimize import least_squares  # half a second that only a drive without units of its profile takes
+
     first, last = float(demand[0]), float(demand[-1])
     share = (np.asarray(demand, dtype=np.float64) - first) / (last - first)
     moves = np.flatnonzero((share != 0.0) & (share != 1.0))
-    middle = float(np.interp(0.5, share, t_s))
     seen = max(float(t_s[moves[-1]] - t_s[moves[0]]) if moves.size else 0.0, float(np.min(np.diff(t_s))))
-    ramps, widths = SHARES, WIDTHS * seen
-    best = (0.0, seen)
-    for _ in range(ROUNDS):
-        grid = np.array([(ramp, width) for ramp in ramps for width in widths])
-        age = np.abs(t_s - middle) / grid[:, 1:]  # of half a move, which is symmetric: 0.5 at its ends
-        ramp = grid[:, :1]
-        left = np.maximum(0.5 - age, 0.0)
-        rest = np.where(left < ramp, left**2 / np.maximum(2.0 * ramp, 1e-12), left - 0.5 * ramp) / (1.0 - ramp)
-        wrong = np.sum((np.where(t_s < middle, rest, 1.0 - rest) - share) ** 2, axis=1)
-        best = tuple(grid[int(np.argmin(wrong))])
-        ramps = np.clip(best[0] + NARROWER * 0.5 * (SHARES - 0.25), 0.0, 0.5)
-        widths = best[1] * (1.0 + NARROWER * (WIDTHS - WIDTHS.mean()))
-    ramp_share, duration = best
-    return abs(last - first) / (duration * (1.0 - ramp_share)), ramp_share * duration
+
+    def off(x: Array) -> Array:
+        even, ramp, middle = x * seen  # the way at full speed would take ``even``
+        ramp = min(ramp, even)
+        age = np.abs(t_s - middle)  # a move is symmetric
+        left = np.maximum(0.5 * (even + ramp) - age, 0.0)
+        way = np.where(left < ramp, 0.5 * left**2 / max(ramp, 1e-12), left - 0.5 * ramp) / even
+        return np.asarray(np.where(t_s < middle, way, 1.0 - way) - share)
+
+    middle = float(np.interp(0.5, share, t_s)) / seen
+    fits = [least_squares(off, (1.0 - ramp, ramp, middle), bounds=BOUNDS, x_scale=SCALES) for ramp in STARTS]
+    even, ramp, _ = min(fits, key=lambda fit: float(fit.cost)).x * seen
+    return abs(last - first) / float(even), float(min(ramp, even))
 
 
 def mirrored(t_s: Array, demand: Array) -> tuple[Array, Array]:

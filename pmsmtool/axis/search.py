@@ -2,7 +2,8 @@
 """Gains of an axis: the stiffest control whose margins hold over the whole tolerance box.
 
 Maximised is K_i K_v, the integral gain from position error to torque: its inverse is the integral of the position error
-after a step of load torque. Constraints are least phase margin and largest |S|, of the speed loop alone and of both
+after a step of load torque. Where nothing feeds the speed forward a move stays v / K_v behind, too, and K_i K_v^2 is
+maximised. Constraints are least phase margin and largest |S|, of the speed loop alone and of both
 loops together. Source of the principle: K. J. Astrom, H. Panagopoulos, T. Hagglund, Automatica 34 (1998) 585.
 
 A loop is looked at on a grid of frequencies that has points inside every resonance: those of the path and those of the
@@ -177,8 +178,10 @@ def _notches(path: AxisPath, allowed: bool) -> Iterator[Notch]:
             yield Notch(path.shaft.resonance_hz, NOTCH_DEPTH * width, width)
 
 
-def stiffest(box: Box, limits: Limits, *, notch: bool = True, loops: Sequence[Loop] = LOOPS) -> AxisGains:
-    """Return the gains with the largest K_i K_v that keep the limits over the box. Raises DesignInfeasible: none does.
+def stiffest(
+    box: Box, limits: Limits, *, notch: bool = True, loops: Sequence[Loop] = LOOPS, fed: bool = True
+) -> AxisGains:
+    """Return the stiffest gains that keep the limits over the box. Raises DesignInfeasible: none does.
 
     Parameters
     ----------
@@ -186,14 +189,17 @@ def stiffest(box: Box, limits: Limits, *, notch: bool = True, loops: Sequence[Lo
         Whether the drive has a notch to set.
     loops : sequence of str
         Those that these gains decide; of ``speed`` alone K_v is not looked at.
+    fed : bool
+        Whether the speed of the reference is fed forward.
     """
     path = box.path
     positions = POSITION_RATIOS if "position" in loops else POSITION_RATIOS[:1]
+    power = 1 if fed else 2
     best: AxisGains | None = None
     for shape in sorted(
-        itertools.product(INTEGRAL_RATIOS, positions, _notches(path, notch)), key=lambda one: one[0] * one[1]
+        itertools.product(INTEGRAL_RATIOS, positions, _notches(path, notch)), key=lambda one: one[0] * one[1] ** power
     ):
-        floor = 0.0 if best is None else _least(best, path, shape)
+        floor = 0.0 if best is None else _least(best, path, shape, power)
         found = _fastest(box, limits, shape, floor, loops)
         if found is not None:
             best = found
@@ -216,9 +222,10 @@ def _gains(path: AxisPath, shape: Shape, omega_c: float) -> AxisGains:
     return AxisGains(K_p, K_p * omega_c / integral, omega_c / position, notch)
 
 
-def _least(best: AxisGains, path: AxisPath, shape: Shape) -> float:
-    """Return the crossover from which a shape is stiffer than the best so far."""
-    return float((best.K_i * best.K_v / path.shaft.J * shape[0] * shape[1]) ** (1.0 / 3.0))
+def _least(best: AxisGains, path: AxisPath, shape: Shape, power: int) -> float:
+    """Return the crossover from which a shape has more K_i K_v^power than the best so far."""
+    wanted = best.K_i * best.K_v**power / path.shaft.J * shape[0] * shape[1] ** power
+    return float(wanted ** (1.0 / (2.0 + power)))
 
 
 def _fastest(box: Box, limits: Limits, shape: Shape, floor: float, loops: Sequence[Loop]) -> AxisGains | None:

@@ -85,6 +85,8 @@ def move_command(
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.drive.envelope import Envelope
     from pmsmtool.drive.guard import guarded
+    from pmsmtool.drive.motion_objects import held_current_limits, low_limits
+    from pmsmtool.drive.own_limits import refuse_no_current
     from pmsmtool.drive.position_drive import PositionDrive
     from pmsmtool.errors import ConfigError
     from pmsmtool.experiments.move import record_move
@@ -103,7 +105,10 @@ def move_command(
         drive = PositionDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
         check_motion(drive.node.map, drive.identity)
         i_max = motion.i_max_apk or drive.current_allowed_apk
-        profile = _profile(design, i_max, speed_rad_s, acceleration)
+        kept = held_current_limits(drive.node, drive.rated_apk)
+        given = min([i_max, *(apk for _, apk in kept)])
+        refuse_no_current(drive.node, given)
+        profile = _profile(design, given, speed_rad_s, acceleration)
         lent, find = _lent(drive, profile)
         speed = profile.get(_SPEED) or _held(drive, _SPEED)
         speed_max = motion.speed_max_rad_s or (SPEED_MARGIN * rad_s_from_rpm(speed) if speed else None)
@@ -119,6 +124,7 @@ def move_command(
         drive.error_limit_rad = ERROR_SHARE * abs(way_rad)
         lines = [
             *envelope.lines(),
+            *low_limits(drive.node, drive.rated_apk),
             f"the shaft moves by {math.degrees(way_rad):.4g} deg and back with the drive's own position loop, {times} "
             f"time{'s' if times > 1 else ''}",
             f"voltage off where the shaft is {math.degrees(drive.error_limit_rad):.3g} deg behind and comes no nearer",

@@ -470,19 +470,28 @@ def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, floa
     return None
 
 
+def held_current_limits(node: DriveNode, rated: float) -> list[tuple[Quantity, float]]:
+    """Return the limits of the current that the drive has, with what they now allow (A peak)."""
+    found = (allowed(node, iter((limit,))) for limit in current_limits(node, rated))
+    return [one for one in found if one is not None]
+
+
+def low_limits(node: DriveNode, rated: float) -> list[str]:
+    """Return the limits of the current that the drive holds far below its rated current, one line each."""
+    return [
+        f"current   the drive itself gives {format_current(apk)}, {100.0 * apk / rated:.3g} % of its rated current "
+        f"({limit}): raise it with the maker's software where the motor may carry more"
+        for limit, apk in held_current_limits(node, rated)
+        if 0.0 < apk < LOW_LIMIT * rated
+    ]
+
+
 def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
     """Return the limits that the drive lacks, or holds far below its rated current, one line each with what to do.
 
     Units of a turn that the map states otherwise than the drive's objects are told with them.
     """
-    lines = unlike_stated(node)
-    for limit in current_limits(node, rated):
-        held = allowed(node, iter((limit,)))
-        if held is not None and 0.0 < held[1] < LOW_LIMIT * rated:
-            lines.append(
-                f"current   the drive itself gives {format_current(held[1])}, {100.0 * held[1] / rated:.3g} % of its "
-                f"rated current ({limit}): raise it with the maker's software where the motor may carry more"
-            )
+    lines = [*unlike_stated(node), *low_limits(node, rated)]
     if allowed(node, current_limits(node, rated)) is None:
         lines.append(
             "current   no limit in the drive (0x6073, 0x6072, or the maker's own): no command asks for more, and this"

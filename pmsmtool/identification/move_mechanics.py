@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from pmsmtool.arrays import Array
-from pmsmtool.axis.move import RESTING
+from pmsmtool.axis.move import moving
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.shaft.inertia_ratio import LEAST_PUSHES, estimate_ratios
 from pmsmtool.identification.by_pulses import either_reading
@@ -132,8 +132,7 @@ def _with_offset(
 def halves_of_moves(trace: Trace) -> Sequence[Trace]:
     """Return the two halves of every move, however short: before and after the demand is fastest."""
     t, demand = trace.t_s, trace["theta_ref_rad"]
-    moving = np.abs(np.diff(demand, prepend=demand[:1])) > RESTING * abs(float(trace.meta["way_rad"]))
-    at = np.flatnonzero(moving)
+    at = np.flatnonzero(moving(trace))
     if not at.size:
         return []
     breaks = np.flatnonzero(np.diff(t[at]) > GAP_S)

@@ -19,7 +19,7 @@ from pmsmtool.cia402 import HOMING_LOST, LEAST_LINK_V
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive, guarded
-from pmsmtool.drive.motion_objects import allowed, current_limits, rated_apk, speed_limits, trips_itself
+from pmsmtool.drive.motion_objects import allowed, held_current_limits, rated_apk, speed_limits, trips_itself
 from pmsmtool.drive.own_limits import refuse_no_current
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
 from pmsmtool.drive.torque_drives import SpeedPushDrive, TorqueDrive, pushing_drive
@@ -214,10 +214,8 @@ def envelope_of(drive: CanopenDrive, request: IdentifyRequest, known: MachineFil
     """
     node = drive.node
     rated = rated_apk(node)
-    for limit in current_limits(node, rated):  # what the drive allows now is not raised
-        held = allowed(node, iter((limit,)))
-        rated = rated if held is None else min(rated, held[1] / HEADROOM)
-    rated = min(rated, drive.shows_apk / HEADROOM)
+    kept = [apk for _, apk in held_current_limits(node, rated)]  # what the drive allows now is not raised
+    rated = min([rated, *(apk / HEADROOM for apk in (*kept, drive.shows_apk))])
     speed = allowed(node, speed_limits(node))
     rpm = (drive.parameters.held_value("motor.n_max_rpm") or UNLIMITED_RPM) if speed is None else speed[1]
     if known is not None:

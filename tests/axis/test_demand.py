@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
-from pmsmtool.axis.reference import Profile, plan, trapezoid_of
+from pmsmtool.axis.reference import Move, Profile, plan, trapezoid_of
 
 SPEED_WITHIN, RAMP_WITHIN = 0.015, 0.02
 """Relative; measured 1.0 % both."""
@@ -24,6 +26,23 @@ def test_speed_and_ramp_of_a_trapezoid(speed: float, acceleration: float, sign: 
     peak = min(speed, np.sqrt(acceleration * 1.0))
     assert found == pytest.approx(peak, rel=SPEED_WITHIN)
     assert ramp == pytest.approx(peak / acceleration, rel=RAMP_WITHIN)
+
+
+POPULATION_SPEED, POPULATION_RAMP = 0.005, 0.05
+"""Relative; measured 0.01 % and 0.8 %. A search on a grid was 46 % off in the ramp once, and 8 to 14 % three times."""
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_ramps_of_any_share_of_the_move(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    way, speed = rng.uniform(0.5, 6.0), math.exp(rng.uniform(math.log(0.5), math.log(20.0)))
+    ramp_s = min(math.exp(rng.uniform(math.log(0.01), math.log(0.5))), 0.9 * way / speed)
+    unit = 2.0 * np.pi / 65536
+    t = np.arange(-0.05, way / speed + ramp_s + 0.1, 1e-3) + rng.uniform(0.0, 1e-3)
+    demand = unit * np.round(Move(way, 0.0, ramp_s, way / speed).at(np.maximum(t, 0.0))[0] / unit)
+    found, ramp = trapezoid_of(t, demand)
+    assert found == pytest.approx(speed, rel=POPULATION_SPEED)
+    assert ramp == pytest.approx(ramp_s, rel=POPULATION_RAMP)
 
 
 def test_a_step_of_the_speed_has_no_ramp() -> None:

@@ -9,6 +9,7 @@ import pytest
 from pmsmtool.axis.move import compared_moves, move_result, same_move, shown
 from pmsmtool.axis.reference import Profile, plan
 from pmsmtool.errors import IdentificationError
+from pmsmtool.identification.move_mechanics import halves_of_moves
 from pmsmtool.trace import Trace
 
 WAY = 1.5
@@ -52,6 +53,17 @@ def test_an_error_that_stays_outside_has_not_settled() -> None:
     assert found.settling_s == np.inf and found.error_end_rad == pytest.approx(0.1, rel=1e-3)
     rows = {row.name: row for row in compared_moves(found, found)}
     assert rows["settling_s"].shown_ratio == "-" and shown(found.settling_s, "s") == "not within the record"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_demand_that_is_noisy_at_rest_rests(seed: int) -> None:
+    """A demand of position and following error: all moves of a record were one, of 3.2 s, and none ever ended."""
+    trace = record(5e-3)
+    noise = 5e-4 * np.random.default_rng(seed).standard_normal(trace.t_s.size) * (trace.t_s > 0.2)
+    noisy = Trace(trace.t_s, trace.signals | {"theta_ref_rad": trace["theta_ref_rad"] + noise}, trace.units, trace.meta)
+    found = move_result(noisy)
+    assert found.moving_s == pytest.approx(move_result(trace).moving_s, abs=0.02)
+    assert np.isfinite(found.settling_s) and len(halves_of_moves(noisy)) == 4
 
 
 def test_the_same_move_has_the_same_way_and_speed() -> None:

@@ -105,6 +105,15 @@ def test_a_drive_that_gives_a_tenth_of_its_current_is_no_wrong_wiring(tool: Tool
 MOVE: tuple[Row, ...] = ((0x607A, 0, "I32", "rw", "0"), (0x60F4, 0, "I32", "ro", ""))
 
 
+@pytest.mark.chain
+def test_a_move_says_that_the_drive_gives_little_current(tool: Tool) -> None:
+    """It named 6.08 A alone, and showed a shaft that a tenth of it left 28 degrees behind."""
+    write_eds(Path("x.eds"), unknown("0x2D", (0x6072, 0, "U16", "rw", "300"), *MOVE))
+    drive = ("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes")
+    ended, _, said = tool("move", "--by", "40deg", "--speed-max", "100rpm", *drive)
+    assert ended == 0 and "30 % of its rated current (0x6072)" in said, said
+
+
 @pytest.mark.parametrize(("rows", "told"), [(unknown("0x1", *MOVE), True), (unknown("0x1"), False)])
 def test_a_drive_without_torque_mode_is_led_to_moves(tool: Tool, rows: tuple[Row, ...], told: bool) -> None:
     write_eds(Path("x.eds"), rows)
