@@ -164,8 +164,6 @@ class ResistanceResult:
         ``warn`` when the fit is above its chi-square limit.
     copper : Copper
         What R is taken to another temperature by.
-    warming_k_per_a2s : float
-        What the winding's sensor rises by per square of a current and time, before the heat goes on; 0 without one.
     """
 
     R_s: Estimate
@@ -175,7 +173,6 @@ class ResistanceResult:
     drift: float
     verdict: Verdict
     copper: Copper = Copper()
-    warming_k_per_a2s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,19 +349,6 @@ def _heated(t: Array, i: Array, peak: float, tau_s: float) -> Array:
         out[k] = warm + late * ((current / peak) ** 2 - warm)
         warm, before = warm + rest * ((current / peak) ** 2 - warm), now
     return out
-
-
-def warming(levels: Trace) -> float:
-    """Return what a winding of one time constant rises by per square of a current (A peak) and time (K/(A2 s)).
-
-    0 without a sensor, and where it does not rise. Of all levels: between the ones left out something else flowed.
-    """
-    T_c, time_s = levels["T_winding_c"], np.diff(levels.t_s)
-    if not np.all(np.isfinite(T_c)):
-        return 0.0
-    columns = np.stack([levels["i_d_a"][1:] ** 2, 0.5 * (T_c[1:] + T_c[:-1]), np.ones_like(time_s)], axis=1)
-    x, *_ = np.linalg.lstsq(columns * time_s[:, None], np.diff(T_c), rcond=None)
-    return max(0.0, float(x[0]))
 
 
 def _level_sigma(t: Array, fall: Array, i: Array, v: Array, peak: float, R_0: float, noise_v: float) -> float:

@@ -35,7 +35,6 @@ from pmsmtool.estimators.resistance import (
     estimate_resistance,
     resistance_warmed,
     settled_levels,
-    warming,
 )
 from pmsmtool.estimators.sensor_mismatch import SensorMismatch, estimate_mismatch, widened, without_mismatch
 from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
@@ -89,6 +88,7 @@ class Evaluation:
     ``swing_hz`` is where pushes swing the shaft and no linear response does (Hz), ``unseen_hz`` from where on a shaft
     that is not rigid may swing unseen.
     ``encoder_noise_rad`` is the standard deviation of a position at rest, without what drifts (mechanical).
+    ``warming_k_per_a2s`` is what the winding's sensor rises by (:func:`warming`).
     ``supply_w`` is the power from which on the DC link gives way (W).
     """
 
@@ -97,6 +97,7 @@ class Evaluation:
     mismatch: SensorMismatch | None = None
     pairs: PairCheck | None = None
     resistance: ResistanceResult | None = None
+    warming_k_per_a2s: float = 0.0
     supply: Finding | None = None
     supply_w: float = math.inf
     encoder: EncoderResult | None = None
@@ -276,6 +277,7 @@ def evaluate(
     if "levels" in traces:
         rest_and_load = traces["zero_current"], traces["levels"]
         result = replace(result, supply=supply_under_load(*rest_and_load), supply_w=supply_power(*rest_and_load)[0])
+        result = replace(result, warming_k_per_a2s=warming(traces["levels"]))
         R = attempt("R", lambda: resistance_of(traces["levels"], result.noise, copper, tolerance, plateau_v))
         if R is not None:
             R = replace(R, R_s=widened(R.R_s, mismatch), R_measured=widened(R.R_measured, mismatch))
@@ -372,14 +374,26 @@ def resistance_of(
     plateau_v: float = 0.0,
 ) -> ResistanceResult:
     """Return the resistance at a reference temperature; levels at which the shaft moved are left out, and counted."""
-    settled, left_out = settled_levels(levels, noise)
-    result = estimate_resistance(settled, noise, tolerance=tolerance, copper=copper, plateau_v=plateau_v)
-    result = replace(result, warming_k_per_a2s=warming(levels))
+    levels, left_out = settled_levels(levels, noise)
+    result = estimate_resistance(levels, noise, tolerance=tolerance, copper=copper, plateau_v=plateau_v)
     if not left_out:
         return result
     note = f"{counted(left_out, 'level')} left out: shaft or voltage moved then"
     fallback = "; ".join(part for part in (result.R_s.fallback, note) if part)
     return replace(result, R_s=replace(result.R_s, fallback=fallback))
+
+
+def warming(levels: Trace) -> float:
+    """Return what a winding of one time constant rises by per square of a current (A peak) and time (K/(A2 s)).
+
+    0 without a sensor, and where it does not rise. Of all levels: between the ones left out something else flowed.
+    """
+    T_c, time_s = levels["T_winding_c"], np.diff(levels.t_s)
+    if not np.all(np.isfinite(T_c)):
+        return 0.0
+    columns = np.stack([levels["i_d_a"][1:] ** 2, 0.5 * (T_c[1:] + T_c[:-1]), np.ones_like(time_s)], axis=1)
+    x, *_ = np.linalg.lstsq(columns * time_s[:, None], np.diff(T_c), rcond=None)
+    return max(0.0, float(x[0]))
 
 
 def as_sampled(

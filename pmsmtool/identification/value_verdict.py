@@ -231,7 +231,7 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions |= {"cogging_nm": evaluation.cogging.J.value * largest.amplitude, "cogging_periods": largest.order}
     if evaluation.resistance is not None and math.isfinite(evaluation.resistance.R_measured.T_c):
         conditions["T_winding_c"] = evaluation.resistance.R_measured.T_c
-        conditions[WARMING] = evaluation.resistance.warming_k_per_a2s
+        conditions[WARMING] = evaluation.warming_k_per_a2s
     return conditions
 
 

@@ -34,8 +34,8 @@ from pmsmtool.estimators.resistance import (
     tail_models,
     two_point_slope,
     unsettled,
-    warming,
 )
+from pmsmtool.identification.evaluate import warming
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters
 from pmsmtool.trace import Trace
