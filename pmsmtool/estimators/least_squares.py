@@ -19,9 +19,8 @@ Residual = Callable[[Array], Array]
 
 RELATIVE_STEP = 1e-5
 """Relative step of the central differences (docs/identification.md, 4)."""
-DAMPING_START = 1e-3
-DAMPING_LIMIT = 1e12
-"""Damping at which no step along the steepest descent lowers the cost any more."""
+DAMPING_START, DAMPING_LIMIT = 1e-3, 1e12
+"""First damping, and that at which no step along the steepest descent lowers the cost any more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,19 +59,10 @@ class Fit:
 
 
 def central_jacobian(residual: Residual, x: Array, step: Array) -> NDArray[np.float64]:
-    """Derivative of a residual by central differences.
-
-    Parameters
-    ----------
-    residual : callable
-        Function of a vector of shape (k,), returning shape (n,).
-    x, step : ndarray, shape (k,)
-        Point and absolute step per parameter.
-    """
+    """Derivative, shape (n, k), of a residual at ``x`` by central differences of ``step``, both of shape (k,)."""
     columns = []
     for index, h in enumerate(step):
-        plus = x.copy()
-        minus = x.copy()
+        plus, minus = x.copy(), x.copy()
         plus[index] += h
         minus[index] -= h
         columns.append((residual(plus) - residual(minus)) / (plus[index] - minus[index]))

@@ -67,8 +67,6 @@ TORQUE_FLOOR = 1e-3
 COASTING_FLOOR = 1e-4  # the same of a coasting, from where it grows
 GROWTH_MOST = 2.5
 """Largest growth of the torque's noise from one fit to the next: a fit that has not arrived asks for too much."""
-COGGING_FITS = 2
-"""Fits where there is cogging: its torque takes the inertia of the one before."""
 SEPARABLE = 0.5e7
 """Largest condition number: a covariance is good to 1e7; below, a friction that is known badly leaves J as it is."""
 RIPPLE_MOST = 0.15
@@ -215,9 +213,9 @@ def estimate_mechanics(
         blocks = blocks_of(0.0)
         start = _start(blocks)
         if harmonics.acceleration_rad_s2:
-            for _ in range(COGGING_FITS - 1):  # the torque over the angle is known as an acceleration
-                found = _fit(blocks_of(math.exp(start[0])), start, elastic)[0].x
-                start = np.delete(found, range(SHAFT, len(found) - 2 * len(runs)))
+            # the torque over the angle is known as an acceleration: it takes the inertia of a fit before
+            found = _fit(blocks_of(math.exp(start[0])), start, elastic)[0].x
+            start = np.delete(found, range(SHAFT, len(found) - 2 * len(runs)))
             blocks = blocks_of(math.exp(start[0]))
         return blocks, *_fit(blocks, start, elastic)
 
