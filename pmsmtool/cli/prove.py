@@ -140,6 +140,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
     from dataclasses import asdict
 
     from pmsmtool.cli.output import table
+    from pmsmtool.proof.drawn_machine import BENT
     from pmsmtool.report.verdict import is_simulated, on_which_drive
 
     facts = {str(value["name"]): value["value"] for value in stage.values if "where" not in value}
@@ -150,7 +151,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
         "prediction": facts["prediction"],
         "cause": facts["cause"],
         "event": facts["event"],
-        "left_out": list(stage.fallbacks),
+        "left_out": [line for line in stage.fallbacks if line != BENT],
         "seen": [
             {"what": value["name"], "share_of_band": value["value"], "inside": value["value"] <= 1.0}
             for value in stage.values
@@ -160,7 +161,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
     rows = [("inside" if line.ok else "OUTSIDE", line.what, line.measured) for line in stage.acceptance]
     out.result("prove", data, lambda: table(("", "response", "measured"), rows))
     for line in stage.fallbacks:
-        out.warn(f"not run: {line}")
+        out.warn(line if line == BENT else f"not run: {line}")
     text = f"{data['verdict']}: {stage.summary if stage.status == 'pass' else stage.note}"
     out.note(on_which_drive(text, asdict(run.read())))
     out.note(f"report: {run.path / 'report.html'}")

@@ -366,7 +366,7 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
         "abort option": node.has(0x6007, 0),
         "quick stop": node.has(0x605A, 0),
         "limits": all(node.has(index, 0) for index in (0x6073, 0x6075, 0x6080)),
-        "line voltage": node.has(0x6079, 0) or {"u_d_v", "u_q_v"} <= set(drive_map.signals),
+        "line voltage": _shows_link(node, drive_map) or {"u_d_v", "u_q_v"} <= set(drive_map.signals),
         "commutation angle": drive_map.capabilities.commutation_angle
         and bool(modes & _bit(Mode.CYCLIC_TORQUE_ANGLE))
         and node.has(0x60EA, 0),
@@ -440,6 +440,12 @@ def _vendor_quantities(node: DriveNode, drive_map: DriveMap) -> frozenset[str]:
         return frozenset()
     there = node.has(OS_COMMAND, 2) and node.has(OS_COMMAND_MODE, 0)
     return tuning.quantities if there else frozenset()
+
+
+def _shows_link(node: DriveNode, drive_map: DriveMap) -> bool:
+    """Whether the drive has an object of its DC link: 0x6079, or the maker's own by its map."""
+    own = drive_map.signals.get("U_dc_v")
+    return node.has(0x6079, 0) or (own is not None and node.has(own.index, own.sub))
 
 
 def _bit(mode: Mode) -> int:

@@ -89,6 +89,24 @@ def test_a_map_with_the_name_plates_number_alone_moves_a_drive(tool: Tool, more:
     assert ended == code, said
 
 
+LINK = """[signals.U_dc_v]
+index = 0x2999
+sub = 0
+type = "INTEGER32"
+unit = "mV"
+source = "plate"
+"""
+
+
+@pytest.mark.parametrize(("link", "told"), [("", False), (LINK, True)])
+def test_a_dc_link_that_the_map_names_may_give_the_flux(tool: Tool, link: str, told: bool) -> None:
+    """psi "needs the DC link", while `check` read it through the map (Copley, Nanotec)."""
+    write_eds(Path("x.eds"), unknown("0x225", (0x2999, 0, "I32", "ro", "540000")))
+    Path("mine.toml").write_text(PLATE.format(more=link), encoding="utf-8")
+    printed = tool("caps", "--eds", "x.eds", "--map", "mine.toml")[1]
+    assert any(line.startswith("psi        standard") for line in printed.splitlines()) == told, printed
+
+
 @pytest.mark.chain
 def test_a_drive_that_gives_a_tenth_of_its_current_is_no_wrong_wiring(tool: Tool) -> None:
     """0x6072 = 100 permille as stored: `check` tried a hundredth of the rated current, and named a shut brake."""
