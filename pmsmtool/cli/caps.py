@@ -128,9 +128,8 @@ def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bo
     drive_map = found.drive_map
     others = len(drive_map.not_written(BY_NAME).keys() - drive_map.left_out.keys())
     unwritten = _unwritten(found, denied)
-    reasons = (
-        (drive_map.row_text(name) if sources or name in denied else name, why) for name, why in unwritten.items()
-    )
+    sourced = denied if found.map_is_drives else {}
+    reasons = ((drive_map.row_text(n) if sources or n in sourced else n, why) for n, why in unwritten.items())
     written = {name: drive_map.cells[name] for name in _written(found, denied)}
     rows = [(f"written: {name}", f"0x{row.index:04X}:{row.sub:02X}", row.wire) for name, row in written.items()]
     lines = [f"written: {drive_map.row_text(name)}" for name in written] if sources else table(("", "", ""), rows)[1:]
