@@ -24,6 +24,9 @@ CONSENT = ("--yes", "--i-max", "3Apk", "--speed-max", "100rpm", "--shaft", "free
 TOLD = "another pmsmtool works with this drive: process"
 
 
+FAILED = "FAILED"
+
+
 def race(server: Server, home: Path, number: int, rng: random.Random) -> str:
     """Run one race and return how it ended."""
     place = json.dumps({"host": "127.0.0.1", "port": server.port})
@@ -46,7 +49,9 @@ def race(server: Server, home: Path, number: int, rng: random.Random) -> str:
     said = [tool.communicate(timeout=60)[1] for tool in tools]
     won = sum(tool.returncode == 0 for tool in tools)
     told = sum(tool.returncode == 3 and TOLD in text for tool, text in zip(tools, said, strict=True))
-    return {(1, 1): "one won, the other was told who", (2, 0): "one after the other"}.get((won, told), "FAILED")
+    codes = [tool.returncode for tool in tools]
+    known = {(1, 1): "one won, the other was told who", (2, 0): "one after the other"}
+    return known.get((won, told), f"{FAILED}: exit codes {codes}; they said {said}")
 
 
 def main() -> int:
@@ -59,7 +64,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as home, serving("--nv", ":memory:") as server:
         ended = Counter(race(server, Path(home), number, rng) for number in range(runs))
     print(f"{runs} races: {dict(ended)}")
-    return int("FAILED" in ended)
+    return int(any(one.startswith(FAILED) for one in ended))
 
 
 if __name__ == "__main__":
