@@ -18,6 +18,8 @@ from pmsmtool.errors import ConfigError
 
 STARTS = (0.02, 0.1, 0.25, 0.45)
 """Time of a ramp over that of the whole move, from which the fit of a trapezoid begins."""
+WITHIN = 0.02
+"""Shares of the way from its ends between which a demand is seen to change: noise at rest stays outside."""
 BOUNDS = (0.3, 0.0, -np.inf), (1.5, 1.0, np.inf)
 SCALES = (0.1, 0.01, 0.01)
 """Even time, ramp and middle of a move over the time in which the demand is seen to change, and their typical sizes."""
@@ -130,7 +132,7 @@ def trapezoid_of(t_s: Array, demand: Array) -> tuple[float, float]:
 
     first, last = float(demand[0]), float(demand[-1])
     share = (np.asarray(demand, dtype=np.float64) - first) / (last - first)
-    moves = np.flatnonzero((share != 0.0) & (share != 1.0))
+    moves = np.flatnonzero((share > WITHIN) & (share < 1.0 - WITHIN))
     seen = max(float(t_s[moves[-1]] - t_s[moves[0]]) if moves.size else 0.0, float(np.min(np.diff(t_s))))
 
     def off(x: Array) -> Array:

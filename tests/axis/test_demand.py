@@ -45,6 +45,22 @@ def test_ramps_of_any_share_of_the_move(seed: int) -> None:
     assert ramp == pytest.approx(ramp_s, rel=POPULATION_RAMP)
 
 
+NOISY_SPEED, NOISY_RAMP = 0.005, 0.01
+"""Relative; measured 0.2 % and 0.3 %. With the noise of a rest of a second taken for motion the speed was 93 % off."""
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_noise_at_rest_is_no_motion(seed: int) -> None:
+    rng = np.random.default_rng([7, seed])
+    way, speed, ramp_s = rng.uniform(0.5, 6.0), rng.uniform(1.0, 20.0), rng.uniform(0.02, 0.1)
+    ramp_s = min(ramp_s, 0.9 * way / speed)
+    t = np.arange(-1.0, way / speed + ramp_s + 1.0, 1e-3)
+    demand = Move(way, 0.0, ramp_s, way / speed).at(np.maximum(t, 0.0))[0] + 3e-4 * rng.standard_normal(t.size)
+    found, ramp = trapezoid_of(t, demand)
+    assert found == pytest.approx(speed, rel=NOISY_SPEED)
+    assert ramp == pytest.approx(ramp_s, rel=NOISY_RAMP)
+
+
 def test_a_step_of_the_speed_has_no_ramp() -> None:
     t = np.arange(0.0, 0.5, 1e-3)
     speed, ramp = trapezoid_of(t, np.clip(10.0 * (t - 0.1), 0.0, 1.0))
