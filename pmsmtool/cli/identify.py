@@ -180,11 +180,11 @@ def identify_command(
 def _choose(
     bus: BusOptions, map_file: Path | None, method: str, request: IdentifyRequest, *, everything: bool, supply: bool
 ) -> tuple[Capabilities, Method, IdentifyRequest]:
-    """Ask the drive what it can; return the method, and without a choice of quantities those it gives."""
+    """Ask the drive what it can; return the method, and what of the request it gives."""
     from pmsmtool.cli.drive_access import open_node, read_map
     from pmsmtool.flash.map_gate import check_motion
     from pmsmtool.identification.request import Method
-    from pmsmtool.measurement.capabilities import MEASURING, examine, with_supply
+    from pmsmtool.measurement.capabilities import examine, with_supply
 
     with open_node(bus) as node:
         node.refuse_late()
@@ -193,12 +193,8 @@ def _choose(
         found = with_supply(found)
     check_motion(found.drive_map, found.identity)
     wanted = None if method == "auto" else Method(method)
-    if everything:
-        for candidate in MEASURING if wanted is None else (wanted,):
-            given = tuple(name for name in request.quantities if found.row(name, candidate).available)
-            if given and candidate is not Method.MANUAL:
-                return found, candidate, replace(request, quantities=given)
-    return found, found.require(request.quantities, wanted), request
+    how, given, left = found.choose(request.quantities, wanted)
+    return found, how, replace(request, quantities=given, left_out={} if everything else left)
 
 
 def _tell_more(found: Capabilities, request: IdentifyRequest, out: Output) -> None:

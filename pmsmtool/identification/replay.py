@@ -15,6 +15,7 @@ from pmsmtool.identification.by_vendor import ANSWERS
 from pmsmtool.identification.calibration import calibrated_tolerance
 from pmsmtool.identification.request import REQUEST, dump_request, parse_request
 from pmsmtool.identification.run_files import MACHINE, NAMEPLATE
+from pmsmtool.identification.value_verdict import with_left_out
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.run_directory import RunDirectory, Stage
 
@@ -57,6 +58,7 @@ def replay(run: RunDirectory, tolerance: SensorTolerance | None = None, calibrat
     else:
         assert known is not None
         stage = by_injection.evaluated_stage(run, known, request)
+    stage = with_left_out(stage, request)
     if recorded is not None and _are_others(run, recorded, stage):
         run.save(REQUEST, dump_request(request))
         run.add(replace(stage, seconds=recorded.seconds))

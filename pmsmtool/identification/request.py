@@ -129,6 +129,8 @@ class IdentifyRequest:
         loop, and nothing else shows it.
     tolerance : SensorTolerance
         Declared sensor tolerances.
+    left_out : mapping of str to str
+        Quantities that a person named beside these, and why this drive does not give them: refused by that reason.
     """
 
     quantities: tuple[str, ...] = QUANTITIES
@@ -141,6 +143,7 @@ class IdentifyRequest:
     map_if_saturated: bool = False
     resonance: bool = False
     tolerance: SensorTolerance = field(default_factory=SensorTolerance)
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def measured(self) -> tuple[str, ...]:
@@ -179,6 +182,8 @@ def dump_request(request: IdentifyRequest) -> str:
     facts = asdict(request)
     if request.accuracy is None:
         del facts["accuracy"]  # a run without one keeps its bytes
+    if not request.left_out:
+        del facts["left_out"]  # likewise
     if math.isinf(request.tolerance.U_dc_v):
         del facts["tolerance"]["U_dc_v"]  # comes from the nameplate, and JSON has no infinity
     return json.dumps(facts, indent=1) + "\n"

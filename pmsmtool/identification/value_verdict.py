@@ -24,7 +24,7 @@ from pmsmtool.identification.completed_machine import CompletedMachine
 from pmsmtool.identification.evaluate import NOTABLY_WIDER, Evaluation
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
 from pmsmtool.identification.sampling import timing_warnings
-from pmsmtool.identification.verdicts import NOT_ACCEPTED, STEP, Verdicts, verdicts_of
+from pmsmtool.identification.verdicts import KEYS, NOT_ACCEPTED, STEP, Verdicts, verdicts_of
 from pmsmtool.identification.wiring import SUPPLY, WRONG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
@@ -367,6 +367,19 @@ def stage_of(
         note="" if made.machine is not None else "a part of the machine only: no machine file is written",
         summary="; ".join(filter(None, (summary, *lost, *refused, *given))),
         refused=dict(verdicts.refused),
+    )
+
+
+def with_left_out(stage: Stage, request: IdentifyRequest) -> Stage:
+    """Refuse in a stage what was asked for and this drive does not give; each reason is said once."""
+    if not request.left_out:
+        return stage
+    keys = {key for name in request.left_out for key in KEYS.get(name, ())}
+    return replace(
+        stage,
+        status="partial" if stage.status == "pass" else stage.status,
+        refused={**stage.refused, **request.left_out},
+        fallbacks=[line for line in stage.fallbacks if not set(line.partition(":")[0].split(", ")) <= keys],
     )
 
 

@@ -39,6 +39,7 @@ from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of,
 from pmsmtool.drive_maps.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
 from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.identification.request import Method
+from pmsmtool.identification.value_verdict import NOT_TOLD
 from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.plain_text import by_reason
@@ -287,14 +288,19 @@ class Capabilities:
         """What every motion needs: a reference drive without its own safety is not moved by a lower level either."""
         return _SAFE if self.drive_map.staging else ()
 
-    def require(self, quantities: Sequence[str], method: Method | None) -> Method:
-        """Return the method that gives all the quantities: the one asked for, else the first that does.
+    def choose(
+        self, quantities: Sequence[str], method: Method | None
+    ) -> tuple[Method, tuple[str, ...], dict[str, str]]:
+        """Return the first method that gives all, else any of the quantities; which; and why it leaves others out.
 
-        Raises NotAvailable: none does; for every quantity the message names what is missing.
+        Raises NotAvailable: none gives any; for every quantity the message names what is missing.
         """
-        for candidate in MEASURING if method is None else (method,):
-            if candidate in MEASURING and all(self.row(name, candidate).available for name in quantities):
-                return candidate
+        candidates = [way for way in (MEASURING if method is None else (method,)) if way in MEASURING]
+        for least in (len(quantities), 1):
+            for way in candidates:
+                given = tuple(name for name in quantities if self.row(name, way).available)
+                if len(given) >= least:
+                    return way, given, {name: self._why_not(name, method) for name in quantities if name not in given}
         raise NotAvailable(
             "\n  - ".join(["this drive cannot measure what was asked for", *self._reasons(quantities, method)]),
             where=f"node {self.identity.node}",
@@ -306,21 +312,20 @@ class Capabilities:
         """Return one line per reason, with the quantities that it stands in the way of."""
         lines: list[tuple[str, str]] = []
         for quantity in quantities:
-            rows = [self.row(quantity, m) for m in (WAYS[quantity] if method is None else (method,))]
-            if any(row.available and row.method in MEASURING for row in rows):
-                lines.append(
-                    (quantity, f": by itself yes ({self._how(quantity, method)}), together with the others no")
-                )
-                continue
-            for row in rows:
+            for row in (self.row(quantity, m) for m in (WAYS[quantity] if method is None else (method,))):
                 if row.method in MEASURING or method is not None:
                     needs = f"not available: needs {', '.join(row.missing)}" if row.missing else "a number you bring"
                     lines.append((quantity, f" by {row.method}: {needs}"))
         return by_reason(lines, "")
 
-    def _how(self, quantity: str, method: Method | None) -> str:
-        best = self.best(quantity)
-        return str(method or (best.method if best else ""))
+    def _why_not(self, quantity: str, method: Method | None) -> str:
+        """Return why a quantity is left out of a run that measures others."""
+        other = self.best(quantity)
+        if other is not None:
+            return f"not by the same method as the others: `pmsmtool identify {quantity} --method {other.method}`"
+        ways = [way for way in (WAYS[quantity] if method is None else (method,)) if way in MEASURING]
+        lacking = by_reason(((f"by {way}", ", ".join(self.row(quantity, way).missing)) for way in ways), " needs ")
+        return f"{NOT_TOLD}: {'; '.join(lacking)}"
 
 
 _HALL = BY_NAME["hall.commutation"]

@@ -28,6 +28,7 @@ from pmsmtool.flash.map_gate import check_motion
 from pmsmtool.identification.by_vendor import SOURCE
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method, dump_request
 from pmsmtool.identification.run_files import MACHINE
+from pmsmtool.identification.value_verdict import with_left_out
 from pmsmtool.identification.verdicts import KEYS
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.measurement import by_injection, by_pulses, by_vendor
@@ -170,11 +171,11 @@ def identify(
             if row.begun is not None:
                 # what was measured before is not lost: it is evaluated and recorded, and the run ends as it did
                 with contextlib.suppress(PmsmtoolError):
-                    kept = row.evaluate(task, row.begun)
+                    kept = with_left_out(row.evaluate(task, row.begun), request)
                     run.add(replace(kept, status=status_of(error), note=text_of(error), seconds=clock.now() - start))
             raise
         seconds = clock.now() - start
-    return replace(row.evaluate(task, facts), seconds=seconds)
+    return replace(with_left_out(row.evaluate(task, facts), request), seconds=seconds)
 
 
 @contextlib.contextmanager

@@ -25,9 +25,9 @@ from pmsmtool.drive.port import Identity
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
-from pmsmtool.errors import ConfigError, IdentificationError, Interrupted, NotAvailable
+from pmsmtool.errors import ConfigError, Declined, IdentificationError, Interrupted, NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
-from pmsmtool.identification.request import Method
+from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.profile import machine_path
 from pmsmtool.measurement.by_pulses import HEADROOM, push_by_torque, swing_and_record, turn_both_ways
@@ -131,19 +131,19 @@ def test_what_caps_promises_is_what_is_found_without_a_dead_time() -> None:
         assert 0.85 * promised[given] < half <= promised[given], "measured: 6.1 of 6.4 %, 3.7 of 3.7 %"
 
 
-def test_require_names_what_is_missing() -> None:
+def test_a_method_is_chosen_for_what_it_gives_and_the_others_are_named() -> None:
     found = examined("&drive=cia402")
-    assert found.require(["poles", "encoder"], None) is Method.STANDARD
-    with pytest.raises(NotAvailable) as caught:
-        found.require(["L", "poles"], None)
-    text = str(caught.value)
-    assert "L by recorder: not available: needs a recorder of currents and voltages" in text
-    assert "poles: by itself yes (standard)" in text
+    assert found.choose(["poles", "encoder"], None) == (Method.STANDARD, ("poles", "encoder"), {})
+    how, given, left = found.choose(["L", "poles"], None)
+    assert (how, given, list(left)) == (Method.STANDARD, ("poles",), ["L"])
+    assert left["L"].startswith("E_NOT_MEASURED") and "by recorder needs a recorder of currents" in left["L"]
     with pytest.raises(NotAvailable, match="poles by inject"):
-        found.require(["poles"], Method.INJECT)
+        found.choose(["poles"], Method.INJECT)
     full = reference_capabilities(Identity(1, 0, 0, 0, 0))
-    assert full.require(["R", "L", "psi", "map"], None) is Method.INJECT
-    assert full.require(["psi"], Method.RECORDER) is Method.RECORDER
+    assert full.choose(["R", "L", "psi", "map"], None)[0] is Method.INJECT
+    assert full.choose(["psi"], Method.RECORDER)[0] is Method.RECORDER
+    _, given, left = full.choose(["map", "R"], Method.RECORDER)
+    assert given == ("R",) and "`pmsmtool identify map --method inject`" in left["map"]
 
 
 # ---- the command line ------------------------------------------------------------------------------
@@ -187,7 +187,6 @@ def test_caps_of_an_unknown_drive_says_so() -> None:
         ("&drive=cia402", ("L",), "L by recorder: not available: needs a recorder of currents and voltages"),
         ("&drive=epos2", ("mechanics",), "mechanics by standard: not available: needs torque mode"),
         ("&level=recorder", ("encoder",), "encoder by inject: not available: needs"),
-        ("&level=recorder", ("R", "encoder"), "R: by itself yes (recorder), together with the others no"),
         ("", ("R", "--method", "vendor"), "R by vendor: not available: needs the maker's identification"),
         ("", ("R", "--method", "manual"), "R by manual: a number you bring"),
         ("", ("map", "--method", "standard"), "map has no standard method"),
@@ -204,6 +203,21 @@ def test_identify_ends_in_exit_9_and_names_what_is_missing(
     reasons = [line.partition(" by ")[2] for line in str(error).splitlines() if " by " in line]
     assert len(reasons) == len(set(reasons)), "one line per reason, however many quantities it is given for"
     assert not (tmp_path / "runs").exists()  # nothing was begun
+
+
+def test_identify_measures_what_the_drive_gives_and_refuses_the_rest_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[IdentifyRequest] = []
+
+    def noted(
+        bus: object, motion: object, out: object, request: IdentifyRequest, *others: object, **more: object
+    ) -> None:
+        asked.append(request)
+        raise Declined("enough is seen")
+
+    monkeypatch.setattr("pmsmtool.cli.identify._measure", noted)
+    outcome = run("--sim", CHANNEL + "&drive=epos4", "--yes", "identify", "R", "L", "psi")
+    assert isinstance(outcome.exception, Declined), "before: exit 9, nothing measured"
+    assert asked[0].quantities == ("psi",) and list(asked[0].left_out) == ["R", "L"]
 
 
 def test_a_locked_shaft_gives_nothing_without_injection(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

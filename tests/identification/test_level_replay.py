@@ -50,7 +50,7 @@ def opened(options: str) -> Iterator[tuple[CanopenDrive, Capabilities]]:
 
 
 def measured(
-    options: str, folder: Path, quantities: tuple[str, ...], known: MachineFile | None = None, **limits: float
+    options: str, folder: Path, quantities: tuple[str, ...], known: MachineFile | None = None, **limits: object
 ) -> tuple[RunDirectory, Stage]:
     request = IdentifyRequest(quantities, **limits)  # type: ignore[arg-type]
     with opened(options) as (drive, found):
@@ -137,14 +137,17 @@ def assert_replayed(run: RunDirectory, stage: Stage) -> None:
 
 def test_a_run_without_a_machine_file_is_replayed_from_the_command_line(tmp_path: Path) -> None:
     """Slow on purpose: the voltage limit is not reached, and what it needs is said with numbers."""
-    run, stage = measured("&drive=cia402", tmp_path, ASKED, speed_max_rad_s=60.0)
+    left = {"L": "E_NOT_MEASURED: by inject needs current set-points"}  # asked for beside the others
+    run, stage = measured("&drive=cia402", tmp_path, ASKED, speed_max_rad_s=60.0, left_out=left)
+    assert not any(line.startswith("L_d_h, L_q_h") for line in stage.fallbacks), "said once, as refused"
     assert not (run.path / MACHINE).exists()
     needed = "up to 561 rpm it was not: allow a larger --speed-max"
     assert any(needed in line for line in stage.fallbacks) and needed in stage.summary
     outcome = CliRunner().invoke(cli, ["--json", "identify", "--replay", str(run.path)])
     assert isinstance(outcome.exception, Partial) and "run.json" in outcome.exception.hint
-    assert stage.status == "partial" and list(stage.refused) == ["psi"] and needed in stage.refused["psi"]
-    assert json.loads(outcome.stdout)["values"] == json.loads(told(stage))[0]
+    assert stage.status == "partial" and list(stage.refused) == ["psi", "L"] and needed in stage.refused["psi"]
+    shown = json.loads(outcome.stdout)
+    assert shown["values"] == json.loads(told(stage))[0] and shown["refused"]["L"] == left["L"]
 
     facts = read_facts(run)
     assert facts is not None
