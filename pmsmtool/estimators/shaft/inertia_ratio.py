@@ -76,8 +76,8 @@ def estimate_ratios(
     """
     tolerance = tolerance or SensorTolerance()
 
-    def parts_at(lag: float, *, whole: bool = False) -> list[Part]:
-        return [part for push in pushes if (part := _part(push, lag, whole)) is not None]
+    def parts_at(lag: float, *, whole: bool = False, of: Sequence[Trace] = pushes) -> list[Part]:
+        return [part for push in of if (part := _part(push, lag, whole)) is not None]
 
     n = len(parts := parts_at(LAGS_S[0]))
     if n < LEAST_PUSHES:
@@ -92,8 +92,9 @@ def estimate_ratios(
         if seen and (measured or salient[0] < full[0]):  # what no loop decouples brakes where L_q > L_d
             salient, std = _with_spread(parts_at(lag, whole=True), sense, pole_pairs, 4)
             left_open, full = SATURATED_SHARE * abs(full[0] - salient[0]), salient
-    weakest = min(abs(float(p[1] @ p[-1] / (p[-1] @ p[-1]))) for p in parts)
-    excess = 0.0 if measured else _amplitude_excess(pushes)
+    driven = [push for push in pushes if push.meta.get("i_command_a") != 0.0]  # not those in which the shaft coasts
+    weakest = min(abs(float(p[1] @ p[-1] / (p[-1] @ p[-1]))) for p in parts_at(LAGS_S[0], of=driven))
+    excess = 0.0 if measured else _amplitude_excess(driven)
     floors = (
         math.hypot(full[0] * math.hypot(tolerance.current_gain, MODEL_FLOOR, excess), left_open),
         math.hypot(full[1] * tolerance.current_gain, FRICTION_FLOOR * torque_per_ampere(pole_pairs, weakest)),
