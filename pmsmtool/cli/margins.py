@@ -170,10 +170,9 @@ def _lines(report: MarginReport, simulated: SimulatedMargins | None) -> Iterator
     yield ""
     yield "limit headroom of the references for the nominal machine (1: nothing needed, 0: at the limit)"
     yield from _table(report.headroom)
-    for name in ("headroom_voltage", "headroom_current"):
-        spread = next(s for s in report.headroom if s.name == name)
+    for spread in report.headroom:
         if spread.worst < 0.0:
-            yield f"worst {name}: {spread.worst_cell}, {_sample(spread.worst_sample)}"
+            yield f"worst {spread.name}: {spread.worst_cell or 'rated torque'}, {_sample(spread.worst_sample)}"
     if report.cells:
         yield ""
         yield from table(

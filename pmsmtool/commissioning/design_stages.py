@@ -182,6 +182,8 @@ def margins_stage(run: RunDirectory, request: MarginRequest) -> Stage:
         f"over {report.corners} corners and {report.samples} samples: phase {phase.worst:.1f} deg ({phase.name}), "
         f"gain {gain.worst:.1f} dB ({gain.name})"
     )
+    if beyond := [f"{spread.name} {spread.worst:.2g}" for spread in report.headroom if spread.unjudged]:
+        summary += f"; not judged: {', '.join(beyond)}"
     values = [_spread_value(spread) for spread in (*report.loops, *report.headroom)]
     return _stage("margins", summary, criteria, values=values, files=(), fallbacks=report.notes)
 

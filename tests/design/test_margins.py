@@ -268,6 +268,10 @@ def test_nominal_voltage_headroom_is_the_reserve_that_was_kept() -> None:
     assert voltage.nominal == pytest.approx(0.08, abs=1e-9)
     assert voltage.worst < 0.0
     assert voltage.worst_cell
+    told = [note for note in report.notes if "not judged" in note]
+    assert [note.split()[0] for note in told] == [s.name for s in report.headroom if s.worst < 0.0]
+    asked = margin_report(design_of(), tolerance_box(design_of().machine), MarginRequest(voltage_headroom=-1.0))
+    assert not [note for note in asked.notes if note.startswith("headroom_voltage")]
     assert report.unreachable and "rpm" in report.unreachable[0]
     worst = voltage.worst_sample
     assert worst["U_dc_v"] == pytest.approx(0.95 * 210.0)

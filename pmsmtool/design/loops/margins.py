@@ -128,6 +128,11 @@ class Spread:
     least: float | None
 
     @property
+    def unjudged(self) -> bool:
+        """Whether this is a headroom that ends beyond its limit, without a least one that was asked."""
+        return self.least is None and self.worst < 0.0 and self.name in _BEYOND
+
+    @property
     def ok(self) -> bool:
         """Whether what was asked holds at every corner and at the judged percentile."""
         if self.least is None:
@@ -159,7 +164,7 @@ class MarginReport(Summarised):
     corners, samples : int
         How many were evaluated.
     notes : tuple of str
-        What was assumed.
+        What was assumed, and each headroom below zero that nobody asked to be judged.
     """
 
     loops: tuple[Spread, ...]
@@ -367,7 +372,22 @@ def margin_report(
         problem.cells.unreachable,
         len(corners),
         samples,
-        box.notes,
+        (*box.notes, *(_told(spread) for spread in spreads if spread.unjudged)),
+    )
+
+
+_BEYOND = {
+    "headroom_voltage": "the references need more voltage than there is",
+    "headroom_current": "rated torque needs more than the largest current",
+    "headroom_thermal": "rated torque warms the winding more than the continuous current at its limit does",
+}
+
+
+def _told(spread: Spread) -> str:
+    option = spread.name.replace("headroom_", "--") + "-headroom"
+    return (
+        f"{spread.name} {spread.worst:.3g} at the worst corner: {_BEYOND[spread.name]}; not judged "
+        f"(`pmsmtool margins {option} RATIO` judges it)"
     )
 
 
