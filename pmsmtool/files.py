@@ -152,6 +152,17 @@ def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: 
         raise ConfigError(f"cannot be written: {reason}", where=str(path), likely=likely, hint=hint) from error
 
 
+def refuse_full(folder: Path, room: int, *, hint: str) -> None:
+    """Make a folder and refuse one that does not take ``room`` bytes; nothing of the trial stays in it.
+
+    Raises ConfigError: it cannot be made or written, or its disk is full; ``hint`` is the next step.
+    """
+    make_folder(folder, hint=hint)
+    trial = Path(folder) / ".room"
+    write_file(trial, bytes(room), hint=hint)
+    trial.unlink(missing_ok=True)
+
+
 def _sync_folder(folder: Path) -> None:
     # Windows cannot open a folder; there the rename is on disk with the file.
     with contextlib.suppress(PermissionError):

@@ -15,6 +15,8 @@ DataFolder = Literal["profiles", "firmware-params"]
 _PACKAGE = Path(__file__).parent
 ELSEWHERE = "check your rights there and the space on the disk; PMSMTOOL_HOME names another folder"
 """Next step where the user's folder cannot be written."""
+USER_ROOM = 1 << 20
+"""Bytes that the user's folder must take before anything moves: a journal with tables has 0.1 MB."""
 BUNDLE = "_data"
 """Folder inside the installed package that the wheel fills; a checkout has none."""
 

@@ -20,10 +20,12 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.files import ROWS_BYTES, read_text, write_file
+from pmsmtool.files import ROWS_BYTES, read_text, refuse_full, write_file
 
 SCHEMA = "pmsmtool.run/1"
 RECORD = "run.json"
+RUN_ROOM = 8 << 20
+"""Bytes that the folder of a run must take before anything moves: a commissioning leaves 2.7 to 5 MB."""
 _OTHER_FOLDER = "choose another folder with --runs DIR"
 _OTHER_RUN = "this run cannot be read or continued: give another one, or begin anew"
 
@@ -134,6 +136,7 @@ class RunDirectory:
 
         Raises ConfigError: if the directory cannot be made or written.
         """
+        refuse_full(parent, RUN_ROOM, hint=_OTHER_FOLDER)
         stem = f"{record.started_utc.replace(':', '').replace('-', '')}-{serial:08x}"
         for attempt in range(100):
             path = parent / (stem if attempt == 0 else f"{stem}-{attempt}")

@@ -3,6 +3,7 @@
 
 import os
 import secrets
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import read_bytes, read_text, write_file
-from pmsmtool.run_directory import RunDirectory
+from pmsmtool.run_directory import RUN_ROOM, RunDirectory, new_record
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import write_trace
 
@@ -117,3 +118,17 @@ def test_another_encoding_is_named(tmp_path):
     with pytest.raises(ConfigError, match="byte 1 is not UTF-8") as caught:
         read_text(tmp_path / "m.toml")
     assert "UTF-16" in caught.value.likely
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size there")
+def test_a_full_disk_is_found_before_a_run_begins(tmp_path):
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (RUN_ROOM // 2, before[1]))
+    try:
+        with pytest.raises(ConfigError, match="cannot be written"):
+            RunDirectory.create(tmp_path, 1, new_record((), drive={}, bus={}, versions={}))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not list(tmp_path.iterdir())

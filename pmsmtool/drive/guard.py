@@ -34,6 +34,8 @@ from pmsmtool.errors import (
     SafetyRefusal,
     StopNotConfirmed,
 )
+from pmsmtool.files import refuse_full
+from pmsmtool.resources import ELSEWHERE, USER_ROOM, user_folder
 from pmsmtool.trace import Trace
 from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 
@@ -516,7 +518,10 @@ def guarded(
         Ctrl-C, after a confirmed stop and the restore.
     SafetyRefusal
         The dead-man could not be shown.
+    ConfigError
+        The user's folder cannot be written, where locks, journals and what is lent to a run are kept.
     """
+    refuse_full(user_folder(), USER_ROOM, hint=ELSEWHERE)
     guard = GuardedDrive(drive, envelope)
     # A signal on the way into or out of the `with` block leaves this generator where it is: closing the node ends it.
     drive.node.before_close.append(lambda: _end(guard, say))

@@ -17,9 +17,8 @@ from click.testing import CliRunner
 from pmsmtool.cli import consent
 from pmsmtool.cli.options import MotionOptions
 from pmsmtool.cli.output import Output
-from pmsmtool.errors import (
-    Declined,
-)
+from pmsmtool.errors import Declined
+from tests.cli.conftest import Tool
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -153,3 +152,11 @@ def test_only_a_simulated_drive_goes_without_its_lines_when_quiet(
     with pytest.raises(Declined):
         ask(["i_max 5 A"], given, simulated=False, serial=7, out=quiet)
     assert "i_max 5 A" in capsys.readouterr().err
+
+
+def test_nothing_moves_where_a_journal_could_not_be_kept(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    Path("home").write_text("", encoding="utf-8")  # a file in place of the folder
+    monkeypatch.setenv("PMSMTOOL_HOME", "home")
+    code, out, told = tool("jog", "--current", "1Apk", "--sim", "interior-2k2?nv=:memory:", "--yes")
+    assert (code, out) == (2, "")
+    assert "PMSMTOOL_HOME names another folder" in told and "supervision tested" not in told
