@@ -44,7 +44,7 @@ def backup_command(
     from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.errors import ConfigError
     from pmsmtool.flash.journal import write_snapshot
-    from pmsmtool.flash.restore import take_backup
+    from pmsmtool.flash.restore import old_marks, take_backup
     from pmsmtool.flash.whole_drive import other_product, require_read, take_whole_backup
 
     if path.exists() and not force:
@@ -75,14 +75,9 @@ def backup_command(
         shown = labels if out.verbosity > 0 else labels[:SHOWN]
         more = f" and {len(labels) - len(shown)} more (-v names them)" if len(shown) < len(labels) else ""
         out.note(f"not saved, {reason}: {', '.join(shown)}{more}")
-    data = {
-        "identity": identity,
-        "file": path,
-        "content": snapshot.content,
-        "objects": len(snapshot.entries),
-        "left_out": left_out,
-    }
-    out.result("backup", data, [f"{len(snapshot.entries)} objects of serial {identity.serial} in {path}"])
+    count = len(snapshot.entries) - len(old_marks(snapshot))  # as `restore` counts: the marks follow from the rest
+    found = {"identity": identity, "file": path, "content": snapshot.content, "objects": count, "left_out": left_out}
+    out.result("backup", found, [f"{count} objects of serial {identity.serial} in {path}"])
     require_read(left_out, path)
 
 

@@ -174,7 +174,8 @@ def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[C
                 "this command needs set-points for d and q, and a recorder at loop rate: this drive lacks them",
                 where=lacking.where,
                 likely="a drive with fixed firmware",
-                hint="`pmsmtool commission` runs every stage that this drive allows, `pmsmtool caps` lists what it has",
+                hint="`pmsmtool move` moves it by its own position loop; `pmsmtool commission` runs what it allows, "
+                "`pmsmtool caps` lists what it has",
             ) from lacking
         check_motion(drive.node.map, drive.identity)
         yield drive

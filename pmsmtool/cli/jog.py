@@ -59,7 +59,8 @@ def jog_command(
 ) -> None:
     """Hold a current vector at a fixed angle, or run at a speed, for a short time; then stop and restore everything.
 
-    A speed jog needs a drive that is set up: pole pairs, encoder offset, gains.
+    A speed jog needs a drive that is set up: pole pairs, encoder offset, gains. Exit code 10 where the shaft misses the
+    speed by more than half. For drives that take set points of d and q; `pmsmtool move` moves all others.
     """
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.drive.envelope import Envelope
@@ -93,21 +94,26 @@ def jog_command(
             elif speed_rad_s is not None:
                 guard.command_speed(speed_rad_s)
             readings = _watch(guard, seconds)
-        if speed_rad_s is not None:
-            _warn_unless_reached(speed_rad_s, _means(readings), drive.read("motor.pole_pairs"), out)
+        pole_pairs = drive.read("motor.pole_pairs")
     facts = {"seconds": seconds, "envelope": envelope, "dead_man": guard.proof, "readings": readings}
     heads = ("quantity", "mean", "unit")
     out.result(
         "jog", facts, lambda: table(heads, [(name, f"{value:.6g}", unit) for name, value, unit in _means(readings)])
     )
+    if speed_rad_s is not None:
+        _require_reached(speed_rad_s, _means(readings), pole_pairs)
 
 
-def _warn_unless_reached(asked: float, means: list[tuple[str, float, str]], pole_pairs: float, out: Output) -> None:
-    speed = abs(next(value for name, value, _ in means if name == "omega_e_rad_s")) / pole_pairs
-    if abs(speed - abs(asked)) > abs(asked) / 2:
-        ran, wanted = rpm_from_rad_s(speed), rpm_from_rad_s(abs(asked))
-        out.warn(f"the shaft ran at {ran:.3g} rpm in place of {wanted:.3g} rpm: likely the drive is not set up "
-                 "(`pmsmtool param get 'speed.K*'`: gains of 0 give no torque), or the load holds it")  # fmt: skip
+def _require_reached(asked: float, means: list[tuple[str, float, str]], pole_pairs: float) -> None:
+    from pmsmtool.errors import Partial
+
+    speed = next(value for name, value, _ in means if name == "omega_e_rad_s") / pole_pairs
+    if abs(speed - asked) > abs(asked) / 2:
+        raise Partial(
+            f"the shaft ran at {rpm_from_rad_s(speed):.3g} rpm in place of {rpm_from_rad_s(asked):.3g} rpm",
+            likely="the drive is not set up: speed gains of 0 give no torque; or the load holds the shaft",
+            hint="`pmsmtool param get 'speed.K*'` shows the gains; `pmsmtool commission` sets the drive up",
+        )
 
 
 def _refuse_beyond(quantity: str, value: float, limit: float, unit: str, name: str) -> None:
