@@ -23,6 +23,7 @@ from pmsmtool.drive.motion_objects import allowed, held_current_limits, rated_ap
 from pmsmtool.drive.own_limits import refuse_no_current
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
 from pmsmtool.drive.torque_drives import SpeedPushDrive, TorqueDrive, pushing_drive
+from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.experiments.current_limit import LimitShown, require_limit, show_torque_limit, unproven
@@ -118,7 +119,7 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say)
         envelope.i_max_apk / HEADROOM, SWING_SHARE * largest, TOP_SHARE * largest,
         omega_failure_rad_s=OVERSHOOT * largest, off_s=OFF_S,
     )  # fmt: skip
-    shows_voltage = all(name in drive.node.map.signals for name in ("u_d_v", "u_q_v"))
+    shows_voltage = _shows_voltage(drive.node.map)
     drive.top_rad_s = ASKED_SHARE * largest
     limit: list[str] = []
     with guarded(drive, envelope, say=say) as guard:
@@ -146,6 +147,10 @@ def push_by_torque(drive: TorqueDrive, envelope: Envelope, keep: Keep, say: Say)
         Method.STANDARD, pushed=True, voltage=voltage, top_rpm=plan.omega_top_rad_s / RAD_S_PER_RPM,
         U_dc_v=max(0.0, U_dc), current_undecided=drive.current_undecided, limit="".join(limit),
     )  # fmt: skip
+
+
+def _shows_voltage(drive_map: DriveMap) -> bool:
+    return {"u_d_v", "u_q_v"} <= set(drive_map.signals)
 
 
 def show_limit(guard: GuardedDrive, answer: ShaftAnswer, most_a: float, say: Say) -> LimitShown | None:
@@ -262,7 +267,12 @@ def measurable(
     pole_pairs = turns or known is not None or "motor.pole_pairs" in found.drive_map.cells
     available = found.row("mechanics", method).available
     if available and pole_pairs and {"psi", "mechanics"} & set(asked):
-        lines.append("J/psi, tau_c/psi from polled torque pulses, psi from the voltage limit or the coasting machine")
+        psi = "no psi: it shows no voltage"
+        if _shows_voltage(found.drive_map):
+            psi = "psi from the voltage of the coasting machine"
+        elif found.row("psi", method).available:
+            psi = "psi where the speed at which the voltage ends is reached"
+        lines.append(f"J/psi, tau_c/psi from polled torque pulses; {psi}")
     elif available and "mechanics" in asked:
         lines.append(OVER_TORQUE_CONSTANT)
     return lines

@@ -370,9 +370,10 @@ def _stage(plan: ProofPlan, record: _Record, event: PmsmtoolError | None, digest
         *({"name": line.what, "value": line.share, "where": line.where} for line in found.seen),
     ]
     files = [f"{folder}/{PREDICTION}", *(f"{folder}/{name}.npz" for name in record.done)]
+    not_shown = tuple(f"not shown: {line}" for line in (*plan.left_out, *record.left_out))
     return Stage(
         "prove", "pass" if good else "fail", 0.0, values=values, acceptance=criteria,
-        files=dict.fromkeys(files, ""), fallbacks=(*plan.left_out, *record.left_out), note="" if good else note,
+        files=dict.fromkeys(files, ""), fallbacks=not_shown, note="" if good else note,
         summary=_summary(found, len(record.done)),
     )  # fmt: skip
 

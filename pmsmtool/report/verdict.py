@@ -219,7 +219,7 @@ def _unfinished(account: Mapping[str, Any], latest: Sequence[Mapping[str, Any]])
 def _shown(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> list[str]:
     """Return what a pass does not show: the experiments that its proof left out, and notes of a run of one stage."""
     proof = next((stage for stage in latest if stage["name"] == "prove"), None)
-    lines = [] if proof is None else [f"not shown by prove: {line}" for line in proof.get("fallbacks", ())]
+    lines = [] if proof is None else [f"prove: {line}" for line in proof.get("fallbacks", ())]
     if len(complete) == 1:
         lines += [str(line) for stage in latest for line in stage.get("not_checked", ())]
     return lines

@@ -272,6 +272,7 @@ def test_recorder_level_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Pa
     proof = run.read().stage("prove")
     assert proof is not None and any("the drive has no excitation" in line for line in proof.fallbacks)
     assert {str(value["name"]).split(":")[0] for value in proof.values if "where" in value} == {"speed_step"}
+    assert all(line.startswith("not shown: ") for line in proof.fallbacks)
     found_verdict = verdict(run.path)
     assert found_verdict.word == "PARTIAL" and found_verdict.lines[0].startswith("7 of 7 stages ran")
     assert f"NOT CHECKED ({SET_UP}): pole pairs, L_d" in found_verdict.headline

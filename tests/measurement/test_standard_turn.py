@@ -14,15 +14,17 @@ import pytest
 from benchmarks.random_drives import draw_drive
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.port import Identity
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import IdentificationError
 from pmsmtool.experiments.vector_turn import FIRST_SHARE, LEAD_S, lead_onto_vector
 from pmsmtool.identification.by_pulses import PulseFacts, pulse_result
 from pmsmtool.identification.request import Method
-from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.measurement import by_pulses
 from pmsmtool.measurement.by_pulses import HEADROOM, TURNS, turn_both_ways
+from pmsmtool.measurement.capabilities import WAYS, Capabilities
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.trace import Trace
 
@@ -147,3 +149,16 @@ def test_dead_time_that_drives_the_swing_is_left_by_a_slower_turn(
         monkeypatch.setattr(by_pulses, "TURNS", ((large, slow_s),))
         turn_both_ways(opened, envelope, traces.__setitem__, lambda text: None)
     assert offset_error_deg(drive, traces) < 0.5  # measured: 0.01 deg
+
+
+@pytest.mark.parametrize(
+    ("seen", "says"),
+    [
+        (("line voltage",), "psi where the speed at which the voltage ends is reached"),
+        ((), "no psi: it shows no voltage"),
+    ],
+)
+def test_the_plan_promises_psi_only_where_a_voltage_shows_it(seen: tuple[str, ...], says: str) -> None:
+    features = frozenset({*WAYS["mechanics"][Method.STANDARD].needs, *seen})
+    found = Capabilities(Identity(1, 0, 0, 0, 1), load_family("cia402"), False, features)
+    assert says in by_pulses.measurable(Method.STANDARD, found, load_machine_file("interior-2k2"))[-1]
