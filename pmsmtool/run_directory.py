@@ -144,8 +144,6 @@ class RunDirectory:
                 (path / "traces").mkdir(parents=True, exist_ok=False)
             except FileExistsError:
                 continue
-            except OSError as error:
-                raise _unwritable(path, error) from error
             run = cls(path)
             run.write(record)
             return run
@@ -284,12 +282,3 @@ def _stage_violations(entry: Any) -> list[str]:
         if numbers and not (isinstance(value.get("name"), str) and isinstance(value.get("unit"), str)):
             wrong.append(f"values[{k}]: without a name, or without a unit")
     return wrong
-
-
-def _unwritable(path: Path, error: OSError) -> ConfigError:
-    return ConfigError(
-        f"cannot write: {error.strerror or error}",
-        where=str(path),
-        likely="a read-only or full disk",
-        hint=_OTHER_FOLDER,
-    )

@@ -309,7 +309,7 @@ BAD: dict[str, tuple[tuple[str, ...], int, str]] = {
     "gravity load": ((*DRIVE, "--load", "gravity"), 5, "a gravity load falls"),
     "a current without a kind": ((*DRIVE, "--i-max", "7A"), 2, "peak or an rms value"),
     "a bandwidth that is none": ((*DRIVE, "--bandwidth-hz", "-1"), 2, "--bandwidth-hz -1.0 is not a positive number"),
-    "unwritable folder": ((*DRIVE, "--runs", "taken/below"), 2, "cannot write"),
+    "unwritable folder": ((*DRIVE, "--runs", "taken/below"), 2, "cannot be made"),
     "no such machine file": ((*DRIVE, "nothing.toml"), 2, "no such file"),
     "a machine file that is none": ((*DRIVE, "taken"), 2, "is not TOML"),
     "nothing to resume": (("--resume", "taken"), 2, "no run.json here|is a file"),

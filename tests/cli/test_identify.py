@@ -178,7 +178,7 @@ CHANNEL = "interior-2k2?nv=drive.nv"
 UNMOVED: dict[str, tuple[tuple[str, ...], int, str]] = {
     "a locked shaft cannot turn": (("--yes", "--shaft", "locked"), 9, "cannot be identified on a locked shaft"),
     "nobody to ask": ((), 7, "no terminal to ask for consent to move the machine"),
-    "unwritable folder": (("--yes", "--runs", "taken/below"), 2, "cannot write"),
+    "unwritable folder": (("--yes", "--runs", "taken/below"), 2, "cannot be made"),
     "unknown quantity": (("--yes", "Q"), 2, "cannot identify Q"),
     "a motor file": (("--yes", "motor.toml"), 2, "identify reads no motor file"),
     "gravity load": (("--yes", "--load", "gravity"), 5, "a gravity load falls"),
