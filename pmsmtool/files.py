@@ -100,7 +100,32 @@ def make_folder(path: Path, *, hint: str = "choose another folder") -> None:
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"cannot be made: {error.strerror}", where=str(path), hint=hint) from None
+        likely = "a file has that name, the disk is read-only or full, or you may not write there"
+        raise ConfigError(f"cannot be made: {error.strerror}", where=str(path), likely=likely, hint=hint) from None
+
+
+def refuse_existing(path: Path, *, force: bool) -> None:
+    """Refuse a file that is there, unless by force, or whose folder is not, before it is worked for; not a device.
+
+    Raises ConfigError: there is such a file, or no such folder.
+    """
+    if str(path).startswith(_DEVICES):
+        return
+    if not path.parent.is_dir():
+        raise ConfigError(
+            "cannot be written: there is no such folder", where=str(path.parent), hint="make it, or choose another one"
+        )
+    if path.exists() and not force:
+        raise ConfigError("the file exists", where=str(path), hint="choose another name, or --force")
+
+
+def refuse_source(source: Path | str, *targets: Path | None) -> None:
+    """Refuse to write a file over the one that it is made from; raises ``ConfigError``."""
+    for path in targets:
+        if path is not None and path.is_file() and Path(source).is_file() and path.samefile(source):
+            raise ConfigError(
+                "this is the file that is read: it would be replaced", where=str(path), hint="choose another name"
+            )
 
 
 def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: str = "choose another folder") -> None:

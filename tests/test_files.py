@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pmsmtool.cli.main import run
 from pmsmtool.errors import ConfigError
-from pmsmtool.files import read_bytes, read_text, write_file
+from pmsmtool.files import read_bytes, read_text, refuse_existing, write_file
 from pmsmtool.run_directory import RUN_ROOM, RunDirectory, new_record
 from pmsmtool.trace import Trace
 from pmsmtool.trace_file import write_trace
@@ -132,3 +133,30 @@ def test_a_full_disk_is_found_before_a_run_begins(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "machine new --name m --pole-pairs 4 --r 1ohm --l 1mH --ke 0.1Wb --u-dc 48V --pwm 10kHz",
+        "backup", "param dump", "scope", "sim clone m.toml", "map learn --machine m.toml", "move --by 9deg",
+    ],
+)  # fmt: skip
+def test_what_files_cannot_give_again_is_not_replaced(command, tmp_path, monkeypatch, capsys):
+    """Before any bus is opened: there is none here."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "old.csv").write_text("precious")
+    assert run([*command.split(), "-o", "old.csv"]) == 2
+    assert "the file exists" in capsys.readouterr().err and (tmp_path / "old.csv").read_text() == "precious"
+    assert run([*command.split(), "-o", "none/new.csv"]) == 2
+    assert "no such folder" in capsys.readouterr().err
+    refuse_existing(Path("/dev/stdout"), force=False)
+
+
+@pytest.mark.parametrize("command", ["tune d.toml", "export params d.toml", "machine map d.toml"])
+def test_what_a_file_is_made_from_is_not_replaced(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    name = "d.toml" if "map" not in command else "d.csv"
+    (tmp_path / name).write_text("precious")
+    assert run([*command.replace("d.toml", name).split(), "-o", f"./{name}"]) == 2
+    assert "this is the file that is read" in capsys.readouterr().err and (tmp_path / name).read_text() == "precious"

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import OWN_FAMILY, WHOLE_SET_S, map_of_drive, map_option, open_node
-from pmsmtool.cli.options import FILE, BusOptions, bus_options, examples, output_options
+from pmsmtool.cli.drive_access import OWN_FAMILY, WHOLE_SET_S, map_of_drive, map_option, new_file, open_node
+from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
@@ -27,15 +27,12 @@ SHOWN = 3
         "pmsmtool -n 5 backup --eds maker.eds -o drive.json      # another maker's drive: all of it",
     ),
 )
-@click.option("-o", "--output", "path", type=FILE, required=True, help="File to write (.json).")
-@click.option("--force", is_flag=True, help="Replace the file.")
+@new_file("path", required=True, help="File to write (.json).")
 @click.option("--eds", metavar="FILE", help="Save every setting that this EDS or DCF lists, byte for byte; no map.")
 @map_option
 @bus_options
 @output_options
-def backup_command(
-    bus: BusOptions, out: Output, path: Path, force: bool, map_file: Path | None, eds: str | None
-) -> None:
+def backup_command(bus: BusOptions, out: Output, path: Path, map_file: Path | None, eds: str | None) -> None:
     """Save every parameter and table of a drive; `pmsmtool restore` brings them back, byte for byte.
 
     With --eds every object of the maker's file that can be written is saved in the order of writing, but commands, set
@@ -47,8 +44,6 @@ def backup_command(
     from pmsmtool.flash.restore import old_marks, take_backup
     from pmsmtool.flash.whole_drive import other_product, require_read, take_whole_backup
 
-    if path.exists() and not force:
-        raise ConfigError("the file exists", where=str(path), hint="choose another name, or --force")
     if eds is not None and map_file is not None:
         raise ConfigError("--eds saves bytes, --map values", hint="give one of them")
     listed = None if eds is None else _listed(eds)

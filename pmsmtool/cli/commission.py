@@ -346,10 +346,7 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
         raise click.exceptions.Exit(int(ExitCode.PARTIAL))
 
 
-_TO_GO_ON = {
-    "partial": ("try: `pmsmtool caps` lists what this drive can measure; --require STAGE makes a missing stage exit 1",)
-}
-"""Next step by the kind of verdict."""
+_OF_PARTIAL = "try: `pmsmtool caps` lists what this drive can measure; --require STAGE makes a missing stage exit 1"
 
 
 def _next_step(run: RunDirectory, error: BaseException) -> str:
@@ -388,7 +385,8 @@ def _show(run: RunDirectory, out: Output, begun: float, *, ended: bool = False) 
         "comparison": [] if identified is None else list(identified.comparison),
     }
     report = f"report: {run.path / 'report.html'}"
-    lines = [*(f"  - {line}" for line in found.details), *_TO_GO_ON.get(found.kind, ()), report, found.headline]
+    advice = [_OF_PARTIAL] if found.kind == "partial" else []
+    lines = [*(f"  - {line}" for line in found.details), *advice, report, found.headline]
     if ended and not out.json:
         for line in (*lines[: len(found.details)], report, found.headline.splitlines()[0]):
             out.note(line)

@@ -17,7 +17,7 @@ import click
 from pmsmtool.cli.options import FILE, SIMULATED_INTERFACE, BusOptions
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import BusError, ConfigError
-from pmsmtool.files import read_text
+from pmsmtool.files import read_text, refuse_existing
 from pmsmtool.plain_text import counted
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pmsmtool.run_directory import RunDirectory
 
 FOLDER = click.Path(file_okay=False, path_type=Path)
+FORCE = "pmsmtool.force"
 LOOKING_S = 30.0
 """Time for the transfers of a command that reads a few objects; a drive that answers needs a second."""
 WHOLE_SET_S = 120.0
@@ -48,6 +49,20 @@ def runs_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add ``--runs`` to a command, which receives ``runs: Path``."""
     text = "Where run directories are made."
     return click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help=text)(function)
+
+
+def new_file(*names: str, **attributes: Any) -> Callable[..., Any]:
+    """Add ``-o`` of a file that files cannot give again; one that is there is replaced with ``--force`` alone."""
+
+    def checked(ctx: click.Context, _: click.Parameter, path: Path | None) -> Path | None:
+        if path is not None:
+            refuse_existing(path, force=ctx.meta[FORCE])
+        return path
+
+    force = click.option("--force", is_flag=True, is_eager=True, expose_value=False, help="Replace the file.",
+                         callback=lambda ctx, _, given: ctx.meta.update({FORCE: given}))  # fmt: skip
+    output = click.option("-o", "--output", *names, type=FILE, metavar="FILE", callback=checked, **attributes)
+    return lambda function: output(force(function))
 
 
 def new_run(bus: BusOptions, drive: CanopenDrive, runs: Path, level: str = "") -> RunDirectory:

@@ -14,7 +14,7 @@ import click
 from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import FILE, NODE, examples, text_options
 from pmsmtool.cli.output import Output
-from pmsmtool.files import read_bytes, write_file
+from pmsmtool.files import read_bytes, refuse_source, write_file
 
 if TYPE_CHECKING:
     from pmsmtool.drive_maps.drive_map import DriveMap
@@ -44,6 +44,7 @@ def _written(command: Callable[..., bytes | str]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def write(path: Path | None, out: Output, **given: Any) -> None:
+        refuse_source(given["design"], path)
         content = command(out=out, **given)
         if path is None:
             if isinstance(content, bytes) and b"\0" in content and sys.stdout.isatty():

@@ -96,10 +96,8 @@ def jog_command(
             readings = _watch(guard, seconds)
         pole_pairs = drive.read("motor.pole_pairs")
     facts = {"seconds": seconds, "envelope": envelope, "dead_man": guard.proof, "readings": readings}
-    heads = ("quantity", "mean", "unit")
-    out.result(
-        "jog", facts, lambda: table(heads, [(name, f"{value:.6g}", unit) for name, value, unit in _means(readings)])
-    )
+    rows = [(name, f"{value:.6g}", unit) for name, value, unit in _means(readings)]
+    out.result("jog", facts, lambda: table(("quantity", "mean", "unit"), rows))
     if speed_rad_s is not None:
         _require_reached(speed_rad_s, _means(readings), pole_pairs)
 
@@ -129,9 +127,7 @@ def _refuse_beyond(quantity: str, value: float, limit: float, unit: str, name: s
 
 
 def _watch(guard: Any, seconds: float) -> list[dict[str, float]]:
-    from pmsmtool.drive.objects import signal_unit
-
-    names = [n for n in ("i_d_a", "i_q_a", "omega_e_rad_s", "U_dc_v", "theta_m_rad") if signal_unit(n)]
+    names = ("i_d_a", "i_q_a", "omega_e_rad_s", "U_dc_v", "theta_m_rad")
     readings = []
     left = seconds
     while left > 0.0:

@@ -8,9 +8,10 @@ from typing import Any
 
 import click
 
+from pmsmtool.cli.drive_access import new_file
 from pmsmtool.cli.options import FILE, FREQUENCY, TIME, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, table
-from pmsmtool.files import write_file
+from pmsmtool.files import refuse_source, write_file
 
 
 class _LineCurrent(click.ParamType[float]):
@@ -95,22 +96,18 @@ class _AllMissingAtOnce(click.Command):
 @click.option("--r-source", type=_SOURCE, help="As --source, for the resistance.", show_default=False)
 @click.option("--l-source", type=_SOURCE, help="As --source, for the inductances.", show_default=False)
 @click.option("--psi-source", type=_SOURCE, help="As --source, for the flux.", show_default=False)
-@click.option("-o", "--output", "path", type=FILE, required=True, help="Machine file to write.")
-@click.option("--force", is_flag=True, help="Replace the file.")
+@new_file("path", required=True, help="Machine file to write.")
 @output_options
-def new_command(path: Path, force: bool, out: Output, **given: Any) -> None:
+def new_command(path: Path, out: Output, **given: Any) -> None:
     """Write a machine file from a datasheet or meter readings.
 
     Line-line or phase, star or delta, rms or peak: every conversion is printed. A torque constant that contradicts the
     back-EMF constant is flagged (exit code 0; the file states which one was used). The table [simulation] is what
     `commission FILE --rehearse FAMILY` and `--eds` need; what is assumed for it is printed.
     """
-    from pmsmtool.errors import ConfigError
     from pmsmtool.machine.datasheet import machine_from_datasheet
     from pmsmtool.machine.machine_file import dump_machine_file, parse_machine
 
-    if path.exists() and not force:
-        raise ConfigError("the file exists", where=str(path), hint="choose another name, or --force")
     sheet, recognised = _sheet(given)
     result = machine_from_datasheet(sheet)
     text = dump_machine_file(result.machine_file)
@@ -185,6 +182,7 @@ def map_command(
 
     if path is not None and path.suffix.lower() not in (".npz", ".csv"):
         raise ConfigError(f"{path.name} is neither .npz nor .csv", hint="choose one of them")
+    refuse_source(source, path)
     flux_map = load_flux_map(source, fill=fill)
     if turn:
         flux_map = flux_map_repair.rotate(flux_map, check_flux_map(flux_map).no_load_angle_rad)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import claimed_node, map_of_drive, map_option
+from pmsmtool.cli.drive_access import claimed_node, map_of_drive, map_option, new_file
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output, table
 
@@ -42,7 +42,7 @@ def map_group() -> None:
 )
 @click.argument("names", metavar="[NAME[=0xINDEX:SUB]]...", nargs=-1)
 @click.option("--machine", "machine_path", type=FILE, required=True, metavar="FILE", help="The machine: its inertia.")
-@click.option("-o", "--output", type=FILE, metavar="FILE", help="Map file to write; none is written without it.")
+@new_file(help="Map file to write; none is written without it.")
 @map_option
 @bus_options
 @motion_options

@@ -86,7 +86,6 @@ def margins_command(
     cores of this computer or on a Dask cluster. Exit code 1 when a margin asked for fails at a corner or at the 5th
     percentile, or when more than 5 % of the simulated drives trip.
     """
-    from pmsmtool.cli.margins import executor
     from pmsmtool.commissioning.held_design import why_not_judged
     from pmsmtool.design.design_file import load_design
     from pmsmtool.design.loops.margins import MarginRequest, margin_report
@@ -127,8 +126,7 @@ def margins_command(
 
         save_figure(margin_figure(report).canvas, plot_path)
     if not ok:
-        bad = [spread.name for spread in (*report.loops, *report.headroom) if not spread.ok]
-        bad += _failed(simulated)
+        bad = [*(s.name for s in (*report.loops, *report.headroom) if not s.ok), *_failed(simulated)]
         raise CheckFailed(
             f"margins asked for are not met: {', '.join(bad)}",
             where=str(file),

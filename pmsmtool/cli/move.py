@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import claimed_node, map_of_drive, map_option, new_run, runs_option
+from pmsmtool.cli.drive_access import claimed_node, map_of_drive, map_option, new_file, new_run, runs_option
 from pmsmtool.cli.options import (
     DURATION,
     FILE,
@@ -58,8 +58,7 @@ TRACE = "traces/move.npz"
               "holds it]")  # fmt: skip
 @click.option("--identify", "machine", metavar="MACHINE", help="Find inertia and friction of this machine (a machine "
               "file) from the moves.")  # fmt: skip
-@click.option("-o", "--output", "path", type=FILE, metavar="FILE", help="Machine file to write with what --identify "
-              "found.  [default: machine.toml of the run]")  # fmt: skip
+@new_file("path", help="Machine file to write with what --identify found.  [default: machine.toml of the run]")
 @click.option("--times", type=click.IntRange(1, 20), help="Moves there and back.  [default: 1, with --identify 4]")
 @click.option("--settle", "settle_s", type=DURATION, default="0.5s", help="How long to look on after the demand ended.")
 @runs_option

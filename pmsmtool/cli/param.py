@@ -19,11 +19,12 @@ from pmsmtool.cli.drive_access import (
     difference_of_drive,
     map_of_drive,
     map_option,
+    new_file,
     open_node,
     read_map,
     warn_of_other_drive,
 )
-from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, output_options, write_options
+from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output, table
 from pmsmtool.plain_text import counted
 
@@ -123,7 +124,7 @@ def set_command(
     epilog=examples("pmsmtool -i pmsmsim param dump --all > params.toml", "pmsmtool -n 5 param dump -o now.toml"),
 )
 @click.option("--all", "everything", is_flag=True, help="Also the values that equal the factory defaults.")
-@click.option("-o", "--output", "path", type=FILE, help="File to write; default: standard output.")
+@new_file("path", help="File to write; default: standard output.")
 @map_option
 @bus_options
 @output_options

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import LOOKING_S, open_node, warn_of_other_drive
-from pmsmtool.cli.options import DURATION, FILE, RATE, BusOptions, WholeNumber, bus_options, examples, output_options
+from pmsmtool.cli.drive_access import LOOKING_S, new_file, open_node, warn_of_other_drive
+from pmsmtool.cli.options import DURATION, RATE, BusOptions, WholeNumber, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def _complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> li
 @click.option("--pdo", is_flag=True, help="Let the drive send them (at most 6); its PDOs are restored afterwards.")
 @click.option("--plain", is_flag=True, help="Draw in the terminal; no page, no browser.")
 @click.option("--port", type=WholeNumber("port", 0, 65535), default=0, help="Port of the page; 0 takes a free one.")
-@click.option("-o", "--output", "path", type=FILE, help="Trace to write at the end (.npz or .csv).")
+@new_file("path", help="Trace to write at the end (.npz or .csv).")
 @bus_options
 @output_options
 def scope_command(
@@ -151,8 +151,6 @@ def _check(signals: tuple[str, ...], path: Path | None) -> None:
             raise ConfigError(f"no live quantity is called {pattern}", where="SIGNAL", hint=hint)
     if path is not None and path.suffix.lower() not in (".npz", ".csv"):
         raise ConfigError(f"{path.name} has no trace format", where=str(path), hint="use .npz or .csv")
-    if path is not None and not path.parent.is_dir():
-        raise ConfigError("there is no such folder", where=str(path.parent), hint="make it, or choose another one")
 
 
 def _chosen(node: DriveNode, signals: tuple[str, ...]) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import map_option
+from pmsmtool.cli.drive_access import map_option, new_file
 from pmsmtool.cli.options import BITRATE, FILE, BusOptions, WholeNumber, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
 
@@ -167,7 +167,7 @@ def _serve(server: SocketcandServer) -> None:
     ),
 )
 @click.argument("machine")
-@click.option("-o", "--output", "path", type=FILE, required=True, help="Machine file of the clone; others beside it.")
+@new_file("path", required=True, help="Machine file of the clone; others beside it.")
 @click.option("--draw", type=_SEED, metavar="SEED", help="Draw the clone's truth from the estimates' intervals.")
 @map_option
 @bus_options

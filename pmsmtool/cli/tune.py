@@ -14,7 +14,7 @@ from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import DB, DEG, FILE, HZ, TOML, examples, options_named, output_options, overspeed_option
 from pmsmtool.cli.output import Output, figure_format, save_figure, table
 from pmsmtool.errors import ConfigError
-from pmsmtool.files import write_file
+from pmsmtool.files import refuse_source, write_file
 from pmsmtool.units import unit_of_key
 
 if TYPE_CHECKING:
@@ -138,15 +138,16 @@ def tune_command(
 
     drive_map = read_map(map_file)
     axis = {name: asked.pop(name) for name in _AXIS}
+    params_path = params_path or _params_path(path)
+    refuse_source(machine, path, params_path)
     if asked.pop("axis"):
-        _axis(load_machine_file(machine), drive_map, asked, axis, path, params_path or _params_path(path), out)
+        _axis(load_machine_file(machine), drive_map, asked, axis, path, params_path, out)
         return
     _refuse_without_axis(axis)
     if plot_path is not None:
         figure_format(plot_path)
     design = _design(load_machine_file(machine), drive_map, asked)
     params = design.parameter_set()
-    params_path = _params_path(path) if params_path is None else params_path
     write_file(path, design_text(design))
     write_file(params_path, params.to_toml())
     if plot_path is not None:
