@@ -144,7 +144,8 @@ def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: 
     hint : str
         Next step where it cannot be written.
     """
-    data = content.encode() if isinstance(content, str) else content
+    # a path in another encoding is in a text as lone surrogates
+    data = content.encode(errors="backslashreplace") if isinstance(content, str) else content
     path = Path(path)
     try:
         if str(path).startswith(_DEVICES) or (path.exists() and not path.is_file()):

@@ -160,3 +160,10 @@ def test_what_a_file_is_made_from_is_not_replaced(command, tmp_path, monkeypatch
     (tmp_path / name).write_text("precious")
     assert run([*command.replace("d.toml", name).split(), "-o", f"./{name}"]) == 2
     assert "this is the file that is read" in capsys.readouterr().err and (tmp_path / name).read_text() == "precious"
+
+
+def test_a_path_in_another_encoding_does_not_end_a_report(tmp_path):
+    """A machine file named in Latin-1 ended `commission` with a traceback, after the drive was written."""
+    path = tmp_path / "report.html"
+    write_file(path, "Mot\udcf6r.toml")
+    assert path.read_text(encoding="utf-8") == "Mot\\udcf6r.toml"

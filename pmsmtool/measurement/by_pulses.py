@@ -271,7 +271,7 @@ def measurable(
         if _shows_voltage(found.drive_map):
             psi = "psi from the voltage of the coasting machine"
         elif found.row("psi", method).available:
-            psi = "psi where the speed at which the voltage ends is reached"
+            psi = "psi where the speed at the voltage limit is reached"
         lines.append(f"J/psi, tau_c/psi from polled torque pulses; {psi}")
     elif available and "mechanics" in asked:
         lines.append(OVER_TORQUE_CONSTANT)

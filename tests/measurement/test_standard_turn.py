@@ -154,7 +154,7 @@ def test_dead_time_that_drives_the_swing_is_left_by_a_slower_turn(
 @pytest.mark.parametrize(
     ("seen", "says"),
     [
-        (("line voltage",), "psi where the speed at which the voltage ends is reached"),
+        (("line voltage",), "psi where the speed at the voltage limit is reached"),
         ((), "no psi: it shows no voltage"),
     ],
 )
