@@ -11,7 +11,7 @@ import codecs
 import re
 import struct
 from collections.abc import Container, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from pmsmtool.data_types import DATA_TYPES, codes
 from pmsmtool.errors import ConfigError
@@ -23,9 +23,11 @@ INTEGER_BITS = {row.code: 8 * row.size for row in DATA_TYPES.values() if row.is_
 NUMBERS = frozenset({*INTEGER_BITS, REAL32, REAL64})
 SIGNED = frozenset(row.code for row in DATA_TYPES.values() if row.is_signed)
 _VAR, _DOMAIN_OBJECT = 0x07, 0x02
+_NOT_COPIED = 0b11
 _HAVE_SUBS: Container[object] = frozenset({0x06, 0x08, 0x09})  # DEFSTRUCT, ARRAY, RECORD
 
-_SECTION = re.compile(r"\s*\[([^\]]*)\]?\s*(?:;.*)?$")
+_SECTION = re.compile(r"\s*\[([^\]=]*)(?:\]\s*(?:(?:;|#|//).*|[^=]*))?$")
+"""Whatever follows on the line: keys behind a section that is not seen would become those of the one before."""
 _OBJECT = re.compile(r"(?:0x)?([0-9A-F]{1,4})(?:[ _]*sub[ _]*([0-9A-F]{1,2}))?\Z", re.IGNORECASE)
 _REMARK = re.compile(r";|//|(?<!16)#|#(?![0-9A-Fa-f])")
 """But ``16#1F`` is the number 0x1F, as IEC 61131-3 writes it."""
@@ -55,7 +57,10 @@ COMMISSIONING = ("devicecomissioning", "devicecommissioning")
 
 @dataclass(frozen=True, slots=True)
 class EdsObject:
-    """One entry of the dictionary as the file describes it; numbers are None where the file has none."""
+    """One entry of the dictionary as the file describes it; numbers are None where the file has none.
+
+    ``copied``: neither "refuse write on download" nor "refuse read on scan" (``ObjFlags``, CiA 306-1).
+    """
 
     index: int
     sub: int
@@ -67,6 +72,7 @@ class EdsObject:
     default: str
     value: str
     line: int
+    copied: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,13 +316,10 @@ def _compact(
     names = sections.get(f"{index:04x}name", Section("", 0))
     values = sections.get(f"{index:04x}value", Section("", 0))
     yield EdsObject(index, 0, "number of entries", UNSIGNED8, "ro", None, None, str(count), "", section.line)
+    shared = _entry(section, index, 1, "", _VAR, node, place, warnings)
     for sub in range(1, count + 1):
         name = names.get(str(sub)) or f"{section.get('parametername')}{sub}"
-        entry = _entry(section, index, sub, name, _VAR, node, place, warnings if sub == 1 else [])
-        value = values.get(str(sub))
-        yield EdsObject(
-            index, sub, name, entry.data_type, entry.access, entry.low, entry.high, entry.default, value, section.line
-        )
+        yield replace(shared, sub=sub, name=name, value=values.get(str(sub)))
 
 
 def _entry(
@@ -350,6 +353,7 @@ def _entry(
             warnings.append(f"{place}sub{sub:X} {key}: {text} is taken for a decimal; an octal one is {int(text, 8)}")
         elif data_type in NUMBERS and key.endswith("value"):
             _number(text, data_type, f"{place}sub{sub:X} {key}", warnings, node)  # says what is no number
+    flags = _number(section.get("objflags"), None, place, [])
     return EdsObject(
         index,
         sub,
@@ -361,6 +365,7 @@ def _entry(
         section.get("defaultvalue"),
         section.get("parametervalue"),
         section.line,
+        not int(flags or 0) & _NOT_COPIED,
     )
 
 

@@ -40,6 +40,7 @@ _NODE_BITS, _FUNCTION_BITS = 0x7F, 0x780
 ABSENT, UNREAD = "this drive does not have it, or only takes it", "the drive does not let it be read"
 """Why an object of the data sheet is not saved; of the second kind something is missing in the backup."""
 _ABSENT = frozenset({AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX, AbortCode.WRITE_ONLY})
+_FLAGGED = "its file says that no backup reads or no download writes it (ObjFlags)"
 _COMMAND, _SET_POINT = "a command", "a set point"
 _BY_INDEX: Mapping[int, str] = {
     **dict.fromkeys((0x1003, 0x1010, 0x1011, 0x1013, *range(0x1023, 0x1027), 0x6040), _COMMAND),
@@ -61,11 +62,12 @@ _BY_NAME: tuple[tuple[re.Pattern[str], str], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """An object that the data sheet says can be read and written."""
+    """An object that the data sheet says can be read and written; ``copied``: also by a backup and a download."""
 
     index: int
     sub: int
     name: str
+    copied: bool = True
 
     @property
     def label(self) -> str:
@@ -80,7 +82,7 @@ def kept_objects(listed: Iterable[Listed]) -> tuple[tuple[Listed, ...], dict[str
     """
     kept, left_out = [], {}
     for item in listed:
-        reason = _BY_INDEX.get(item.index, "")
+        reason = _BY_INDEX.get(item.index, "") or ("" if item.copied else _FLAGGED)
         if not reason and item.index >= OWN_MAKERS:
             reason = next((why for pattern, why in _BY_NAME if pattern.search(item.name)), "")
         if reason:

@@ -91,6 +91,15 @@ def test_a_number_is_the_same_however_it_is_written(
     assert (entry.low, entry.access, entry.data_type) == (value, "rw", code)
 
 
+@pytest.mark.parametrize("behind", ["]", "] # until 1003subFE", "] // x = 3", "] ; x", "] and more", "", " ]"])
+def test_a_section_is_seen_whatever_follows_it(behind: str) -> None:
+    """Not seen, its keys were those of the object before: a length that could be written where there is none."""
+    text = f"[2000]\nDataType=5\nAccessType=ro\n[2001{behind}\nDataType=7\nAccessType=rw\nObjFlags=0x1 ; no download\n"
+    before, entry = parse_eds(text.encode()).objects.values()
+    assert (before.data_type, before.access, before.copied) == (5, "ro", True)
+    assert (entry.index, entry.data_type, entry.access, entry.copied) == (0x2001, 7, "rw", False)
+
+
 @given(st.integers(0, 127), st.integers(0, 0x7FF))
 def test_the_node_id_is_added_on_either_side(node: int, number: int) -> None:
     for text in (f"$NODEID+{number:#x}", f"{number}+$NodeID", f"{number:#X} + $nodeid ; remark"):

@@ -93,6 +93,8 @@ def test_commands_set_points_and_what_is_of_one_device_are_left_out() -> None:
     names = ("Internal LR Identification Control", "Current Mode Setting Value", "Serial number", "Controller gain")
     kept, left_out = kept_objects(Listed(0x2400, sub, name) for sub, name in enumerate(names))
     assert [item.name for item in kept] == ["Controller gain"] and len(left_out) == 3
+    (kept, left_out) = kept_objects([Listed(0x2706, 1, "Save all Parameters", copied=False)])
+    assert not kept and "ObjFlags" in left_out["0x2706:01 Save all Parameters"], "one maker's own save command"
     commands = (0x1003, 0x1010, 0x1011, 0x1013, 0x1023, 0x1026, 0x6040)
     assert not kept_objects(Listed(index, 1, "object") for index in commands)[0]
 

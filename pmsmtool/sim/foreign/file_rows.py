@@ -157,7 +157,8 @@ def _of_eds(data: bytes, eds: Eds) -> Iterator[tuple[tuple[int, int], ObjectRow]
         if index == 0x1018 and not value and identity.get(sub) is not None:
             value = str(identity[sub])
         kind = _CODES.get(data_type, "DOMAIN")
-        yield (index, sub), _row(index, sub, entry.name, kind, access, value, entry.low, entry.high)
+        row = _row(index, sub, entry.name, kind, access, value, entry.low, entry.high)
+        yield (index, sub), row if entry.copied else replace(row, copied=False)
 
 
 def _as_canopen_reads(text: str) -> dict[tuple[int, int], tuple[int, str, str]]:

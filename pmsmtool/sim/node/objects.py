@@ -30,7 +30,8 @@ class ObjectRow:
     """One sub-object, or the heading of a record or array (``container`` set, sub 0).
 
     ``default`` is text as in an EDS; ``low`` and ``high`` are None where only the type bounds the value. ``stored``
-    says that the value survives a reset when it was saved (the parameter set is stored as one image).
+    says that the value survives a reset when it was saved (the parameter set is stored as one image). ``copied`` is the
+    data sheet's word (``ObjFlags``): a backup reads it, a download writes it.
     """
 
     index: int
@@ -47,6 +48,7 @@ class ObjectRow:
     stored: bool
     container: str = ""
     parameter: Parameter | None = None
+    copied: bool = True
 
     @property
     def data_type(self) -> DataType:
