@@ -48,7 +48,7 @@ from pmsmtool.sim.node.face import DriveFace
 from pmsmtool.sim.node.factory import drive_settings
 from pmsmtool.sim.node.family import LEVEL_HIDES, Face, Reduced
 from pmsmtool.sim.node.lss import UNCONFIGURED
-from pmsmtool.sim.node.memory import FileStorage, Memory, RamStorage, Storage
+from pmsmtool.sim.node.memory import FileStorage, Memory, RamStorage
 from pmsmtool.sim.node.node import Node
 from pmsmtool.toml_file import written_value
 
@@ -187,11 +187,14 @@ def parse_channel(text: str | None) -> Channel:
     return Channel(name=name or DEFAULT_PROFILE, simulation=changes, **values)
 
 
-def _storage(channel: Channel, stem: str, position: int) -> Storage:
-    if channel.nv == VOLATILE:
-        return RamStorage()
-    path = MEMORY_FOLDER / f"{stem}.nv" if channel.nv is None else Path(channel.nv)
-    return FileStorage(path if position == 0 else path.with_name(f"{path.stem}-{position + 1}{path.suffix}"))
+def _memory_file(channel: Channel, position: int) -> Path:
+    """Return the file of a drive's memory; another maker's face on a machine has one of its own."""
+    name = machine_path(channel.name).stem
+    other = channel.drive if channel.eds is None else channel.eds.replace("#", "-").replace("/", "-")
+    if other not in (None, OWN_FAMILY):
+        name = f"{name}-{Path(str(other)).stem}"
+    path = MEMORY_FOLDER / f"{name}.nv" if channel.nv is None else Path(channel.nv)
+    return path if position == 0 else path.with_name(f"{path.stem}-{position + 1}{path.suffix}")
 
 
 def _face(channel: Channel, machine_file: MachineFile) -> DriveFace | None:
@@ -267,8 +270,6 @@ def build_line(
     path = machine_path(channel.name)
     machine_file = with_simulation(load_machine_file(path), channel.simulation)
     face = _face(channel, machine_file)
-    other = channel.drive if channel.eds is None else channel.eds.replace("#", "-").replace("/", "-")
-    stem = path.stem if face is None or isinstance(face, Reduced) else f"{path.stem}-{Path(str(other)).stem}"
     plan = None if channel.faults is None else load_faults(channel.faults)
     seed = int(machine_file.simulation.get("seed", 0)) if channel.seed is None else channel.seed  # type: ignore[arg-type]
     line = Line(channel.bitrate or bitrate, plan, seed=seed, instant=instant)
@@ -279,8 +280,8 @@ def build_line(
         settings = replace(
             settings, set_point_filter_s=channel.filter, pdo_jitter_s=channel.jitter, seed=seed + position
         )
-        memory = Memory(_storage(channel, stem, position))
-        line.add_node(Node(line, make_core(machine_file, seed + position), memory, settings))
+        storage = RamStorage() if channel.nv == VOLATILE else FileStorage(_memory_file(channel, position))
+        line.add_node(Node(line, make_core(machine_file, seed + position), Memory(storage), settings))
     line.arm_faults()
     return line
 
@@ -303,9 +304,7 @@ def erase_memory(channel: str | None) -> list[Path]:
     wanted = parse_channel(channel)
     if wanted.nv is not None:
         return []
-    stem = machine_path(wanted.name).stem
-    names = [stem, *(f"{stem}-{position}" for position in range(2, wanted.nodes + 1))]
-    found = [path for name in names if (path := MEMORY_FOLDER / f"{name}.nv").exists()]
+    found = [path for position in range(wanted.nodes) if (path := _memory_file(wanted, position)).exists()]
     for path in found:
         try:
             path.unlink()

@@ -17,7 +17,7 @@ def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     folder = tmp_path / ".pmsmsim"
     folder.mkdir()
-    for name in ("interior-2k2", "interior-2k2-2", "interior-2k2-3", "jercic-2017"):
+    for name in ("interior-2k2", "interior-2k2-2", "interior-2k2-3", "jercic-2017", "interior-2k2-epos4"):
         (folder / f"{name}.nv").write_bytes(b"old")
     return folder
 
@@ -29,6 +29,7 @@ def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (None, {"interior-2k2.nv"}),
         ("interior-2k2?seed=3", {"interior-2k2.nv"}),
         ("interior-2k2?nodes=2", {"interior-2k2.nv", "interior-2k2-2.nv"}),
+        ("interior-2k2?drive=epos4&phase_open=a", {"interior-2k2-epos4.nv"}),
         ("fast-ipm", set()),
         ("interior-2k2?nv=mine.nv", set()),
         ("interior-2k2?nv=:memory:", set()),
@@ -49,4 +50,4 @@ def test_a_machine_file_has_the_memory_of_its_name(memory: Path) -> None:
 def test_a_channel_that_cannot_be_used_erases_nothing(memory: Path) -> None:
     with pytest.raises(ConfigError, match="interior-2k"):
         erase_memory("interior-2k")
-    assert len(list(memory.iterdir())) == 4
+    assert len(list(memory.iterdir())) == 5
