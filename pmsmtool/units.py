@@ -148,6 +148,7 @@ _EXAMPLES = {
     "Wb": "0.41Wb or 410mVs",
     "degC": "25degC",
     "A": "12Apk or 8.5Arms",
+    "1": "0.02 or 2%",
 }
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -355,6 +356,10 @@ def bus_options(function: Function) -> Function:
 
 
 def _output(ctx: click.Context, verbose: int, quiet: bool, json_output: bool) -> Output:
+    for param in ctx.command.params:
+        value = ctx.params.get(param.name or "")
+        if isinstance(value, float) and not math.isfinite(value):  # a range of numbers lets NaN pass
+            raise click.BadParameter(f"{value} is not finite", ctx, param)
     above = ctx.find_root().params if ctx.parent else {}
     verbosity = -1 if quiet or above.get("quiet") else verbose + above.get("verbose", 0)
     ctx.meta[VERBOSITY] = verbosity

@@ -30,6 +30,8 @@ STATED: dict[Protection | None, str] = {"chopper": "brake chopper", "battery": "
 """Those that the tool takes a person's word for."""
 SPEED_ROOM = 1.05
 """Over-speed trip over the largest speed, at least: what a speed loop overshoots."""
+UNLIKELY_TIMES = 3.0
+"""Back-EMF at the rated speed over the DC link above which the unit of psi_f is the likelier cause."""
 HINT = (
     "state what takes the energy: --overspeed-protection chopper (or U_dc_chopper_v), or battery where one feeds the "
     "link; or lower n_max_rpm"
@@ -132,6 +134,11 @@ def fault_reaction(
         f"{i_d_min_a:.4g} A allowed"
     )
     if protection is not None or (machine.n_nom_rpm or 0.0) > from_rpm / SPEED_ROOM:
-        raise DesignInfeasible(what, where="--overspeed-protection" if protection else "n_nom_rpm", hint=HINT)
+        times = (machine.n_nom_rpm or 0.0) / generation_rpm(machine, U_dc_nom_v)
+        likely = f"psi_f_wb in another unit: at the rated speed it makes {times:.3g} times the DC link"
+        raise DesignInfeasible(
+            what, where="--overspeed-protection" if protection else "n_nom_rpm",
+            likely=likely if times > UNLIKELY_TIMES else "", hint=HINT,
+        )  # fmt: skip
     note = f"largest speed {from_rpm / SPEED_ROOM:.4g} rpm, trip at {from_rpm:.4g} rpm: {what}; {HINT}"
     return FaultReaction(from_rpm, 0.0, from_rpm, "gates off: a short circuit takes i_d beyond its limit", note)

@@ -137,6 +137,9 @@ def test_a_dash_is_no_file(tool: Tool) -> None:
         (("tune", "interior-2k2", "-o", "t.json"), "'t.json' ends in .json; what is written is .toml"),
         (("report", ".", "-o", "t.pdf"), "t.pdf: what is written is .html; --pdf writes a .pdf beside the page"),
         (("report", ".", "--junit", "-o", "t.json"), "t.json: what is written is .xml"),
+        (("margins", "d.toml", "--thermal-headroom", "nan"), "'--thermal-headroom': nan is not finite"),
+        (("identify", "R", "--accuracy", "nan"), "'--accuracy': nan is not finite"),
+        (("diff", ".", ".", "--tol", "x%"), "write it like 0.02 or 2%"),
         (("-b", "500k", "scan"), "'500k' is no whole number (decimal or 0x...); did you mean 500000?"),
     ],
 )

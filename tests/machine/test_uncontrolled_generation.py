@@ -75,3 +75,11 @@ def test_a_rated_speed_that_nothing_protects_is_refused() -> None:
     assert "--overspeed-protection chopper" in refused.value.hint
     assert not fault_reaction(rated, U_NOM, U_MAX, 1.4 * n, -190.0, "chopper").note
     assert fault_reaction(rated, U_NOM, U_MAX, 1.4 * n, -1e3).short_from_rpm > 0.0
+
+
+@pytest.mark.parametrize(("psi_f_wb", "named"), [(0.41, False), (410.0, True)])
+def test_a_flux_linkage_in_milliwebers_is_named(psi_f_wb: float, named: bool) -> None:
+    machine = replace(MACHINE, psi_f_wb=psi_f_wb, n_nom_rpm=900.0)
+    with pytest.raises(DesignInfeasible) as told:
+        fault_reaction(machine, U_NOM, U_MAX, 1500.0, -1.0)
+    assert ("psi_f_wb in another unit" in told.value.likely) == named
