@@ -113,7 +113,7 @@ def move_command(
         speed_max = motion.speed_max_rad_s or (SPEED_MARGIN * rad_s_from_rpm(speed) if speed else None)
         if speed_max is None:
             unknown = "the speed of the drive's own move is not known: its map has no row for it"
-            raise ConfigError(unknown, hint="give --speed-max")
+            raise ConfigError(unknown, hint="give --speed and --acceleration, or --speed-max")
         envelope = Envelope(
             i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S * times, load=motion.load,
             travel_rad=TRAVEL_MARGIN * abs(way_rad), shaft=motion.shaft or "free", brake=motion.brake,
