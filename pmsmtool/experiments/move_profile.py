@@ -77,9 +77,10 @@ def find_profile(
     trial.find_speed(slow)
     speed, acceleration = trial.find_ramp(slow)
     trial.go(0.0)
-    trial.speed *= speed_rad_s / slow
+    per_count = speed / trial.speed  # of few counts the nearest may be a tenth off the speed that was aimed at
+    trial.speed = speed_rad_s / per_count
     trial.lend()
-    return MoveProfile(speed / slow * speed_rad_s, acceleration, round(trial.speed), round(trial.ramp))
+    return MoveProfile(per_count * trial.speed, acceleration, round(trial.speed), round(trial.ramp))
 
 
 class _Trial:
@@ -101,6 +102,7 @@ class _Trial:
 
     def find_speed(self, aim: float) -> None:
         """Raise both until the demand moves evenly at a speed (rad/s), or as near as a count comes to it."""
+        tried = set()
         for _ in range(LOOKS):
             seen, even, rise = self._look()
             if seen < self._resolution:
@@ -116,8 +118,9 @@ class _Trial:
                     self.ramp *= min(GROWTH, max(1.2, self._acceleration / max(rise, 1e-9)))
                 continue
             wanted = max(1.0, round(self.speed * min(GROWTH, max(1.0 / GROWTH, aim / seen))))
-            if abs(wanted / self.speed - 1.0) < FLAT:
+            if abs(wanted / self.speed - 1.0) < FLAT or wanted in tried:  # no count between two neighbours
                 return
+            tried.add(self.speed)
             self.speed = wanted
         raise self._lost("its speed does not follow 0x6081")
 
