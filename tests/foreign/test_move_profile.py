@@ -69,7 +69,7 @@ class Profile:
 
 @pytest.mark.parametrize("rpm_per_count", [1.0, 2.0, 0.33])
 def test_a_speed_between_two_coarse_counts_is_scaled_by_what_was_seen(rpm_per_count: float) -> None:
-    """Aimed at 5.5 counts, 5 and 6 were looked at in turn until the search gave up; of 2 rpm a count 44 rpm came for 40."""
+    """Aimed at 5.5 counts, 5 and 6 were tried in turn until the search gave up; in counts of 2 rpm, 40 became 44."""
     unit = rad_s_from_rpm(rpm_per_count)
     drive = Profile(unit)
     found = find_profile(
