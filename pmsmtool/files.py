@@ -111,10 +111,9 @@ def refuse_existing(path: Path, *, force: bool) -> None:
     """
     if str(path).startswith(_DEVICES):
         return
-    if not path.parent.is_dir():
-        raise ConfigError(
-            "cannot be written: there is no such folder", where=str(path.parent), hint="make it, or choose another one"
-        )
+    if not os.access(path.parent, os.W_OK):
+        why = "you may not write there" if path.parent.is_dir() else "there is no such folder"
+        raise ConfigError(f"cannot be written: {why}", where=str(path.parent), hint="choose another folder")
     if path.exists() and not force:
         raise ConfigError("the file exists", where=str(path), hint="choose another name, or --force")
 

@@ -134,11 +134,11 @@ def _sheet(given: dict[str, Any]) -> tuple[Any, str]:
     from pmsmtool.errors import ConfigError
     from pmsmtool.machine.datasheet import Datasheet, parse_emf_constant, parse_torque_constant, torque_constant_by_emf
 
-    both = given.pop("L_h")
-    for name in ("L_d_h", "L_q_h"):
-        given[name] = both if given[name] is None else given[name]
-        if given[name] is None:
-            raise ConfigError("no inductance is given", hint="give --l, or --l-d and --l-q")
+    both, axes = given.pop("L_h"), (given["L_d_h"], given["L_q_h"])
+    if None in axes if both is None else axes != (None, None):
+        raise ConfigError("not one inductance of each axis", hint="give --l, or --l-d and --l-q")
+    if both is not None:
+        given["L_d_h"] = given["L_q_h"] = both
     common = given.pop("source")
     given["sources"] = {
         quantity: given.pop(f"{quantity.lower()}_source", None) or common for quantity in ("R", "L", "psi", "J")

@@ -140,6 +140,13 @@ class Datasheet:
         return self.sources.get(quantity, "datasheet")
 
 
+_ABOVE_ZERO = (
+    "R_ohm", "L_d_h", "L_q_h", "U_dc_v", "f_s_hz", "I_nom_apk", "I_max_apk", "n_nom_rpm", "n_max_rpm", "J_kgm2",
+)  # fmt: skip
+T_LEAST_C, T_MOST_C = -60.0, 250.0
+"""Winding temperatures (degC) at which a resistance is stated or measured."""
+
+
 @dataclass(frozen=True, slots=True)
 class Conversion:
     """One step: what was given, by which rule, and what came out."""
@@ -213,7 +220,8 @@ def parse_emf_constant(text: str, between: Between | None) -> EmfConstant:
     elif (speed := _SPEED_CONSTANT.fullmatch(plain)) and float(speed[1]) > 0.0:
         value, written = 1.0 / (float(speed[1]) * RAD_S_PER_RPM), speed[2]
     if not value > 0.0:
-        raise ConfigError(f"{text!r} is no back-EMF constant", hint="write it like 58Vrms/krpm, 0.39Vpks/rad or 0.41Wb")
+        like = "write it like 58Vrms/krpm, 0.39Vpks/rad or 0.41Wb"
+        raise ConfigError(f"{text!r} is no back-EMF constant", likely=_comma(text), hint=like)
     if written in ("block", "dc"):
         if between == "phase":
             raise ConfigError(f"{text!r} is a direct voltage between two terminals", hint="leave the other word out")
@@ -284,12 +292,17 @@ def torque_constant_by_emf(
 
 def _torque_number(text: str) -> tuple[float, str | None]:
     """Return the value (N m/A) and what is written behind the A."""
-    match = _TORQUE.fullmatch(text.replace(" ", "").replace("N*m", "Nm"))
+    match = _TORQUE.fullmatch(re.sub("N[*.\u00b7]m", "Nm", text.replace(" ", "")))
     if match is None or not float(match[1]) > 0.0:
         raise ConfigError(
-            f"{text!r} is no torque constant", hint="write it like 1.74Nm/Arms, 85mNm/Apk or 85mNm/A block"
-        )
+            f"{text!r} is no torque constant", likely=_comma(text),
+            hint="write it like 1.74Nm/Arms, 85mNm/Apk or 85mNm/A block",
+        )  # fmt: skip
     return float(match[1]) * _TORQUE_UNIT[match[2].replace("-", "")], match[3]
+
+
+def _comma(text: str) -> str:
+    return "a decimal comma: write a point" if "," in text else ""
 
 
 def _scaled(number: str, milli: str) -> float:
@@ -352,8 +365,14 @@ def machine_from_datasheet(sheet: Datasheet) -> DatasheetResult:
 
     The flux comes from K_e where there is one (no-load, no saturation), else from K_t; K_t then is the check.
 
-    Raises ConfigError: neither K_e nor K_t is given.
+    Raises ConfigError: neither K_e nor K_t is given, or a number that no machine has.
     """
+    given = ((name, getattr(sheet, name)) for name in _ABOVE_ZERO)
+    wrong = [f"{name} = {value:g} is not above zero" for name, value in given if value is not None and not value > 0.0]
+    if not T_LEAST_C <= sheet.T_c <= T_MOST_C:
+        wrong.append(f"T_c = {sheet.T_c:g} is not between {T_LEAST_C:g} and {T_MOST_C:g} degC")
+    if wrong:
+        raise ConfigError("the data sheet cannot be used", hint="correct what is listed", violations=wrong)
     steps: list[Conversion] = []
     warnings: list[str] = []
     R_s = _resistance(sheet, steps)

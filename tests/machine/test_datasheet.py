@@ -356,6 +356,26 @@ def test_the_examples_of_the_help_work(tmp_path, monkeypatch):
     assert load_machine_file(tmp_path / "m2.toml").machine.L_q_h == pytest.approx(0.014)
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("--r", "0ohm"), "--r 0 is not above zero"),
+        (("--l", "0H"), "--l-d 0 is not above zero"),
+        (("--l-q", "2mH"), "not one inductance of each axis"),
+        (("--r-temperature", "-300degC"), "-300 is not between -60 and 250 degC"),
+        (("--ke", "8,35Vrms/krpm"), "a decimal comma"),
+    ],
+)
+def test_numbers_that_no_machine_has_are_named_by_their_option(tmp_path, change, says):
+    """A resistance or an inductance of 0 ended with a division by zero."""
+    result = run(*NEW, *EMF, *change, "-o", str(tmp_path / "m.toml"))
+    assert isinstance(result.exception, ConfigError) and says in str(result.exception)
+
+
+def test_a_torque_constant_with_a_point_between_its_units():
+    assert parse_torque_constant("80mN\u00b7m/Arms").value == parse_torque_constant("0.08 N.m/Arms").value == 0.08
+
+
 @pytest.mark.parametrize("command", ["new", "map"])
 def test_a_folder_that_is_not_there(tmp_path, command):
     path = str(tmp_path / "none" / ("m.toml" if command == "new" else "m.npz"))
