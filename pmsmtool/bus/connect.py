@@ -7,7 +7,7 @@ of them up as a network device, whoever made them. A call that may hang in a dri
 
 from __future__ import annotations
 
-import contextlib
+import configparser
 import errno
 import logging
 import socket
@@ -69,11 +69,13 @@ def connect(
     arguments = {key: value for key, value in given.items() if value is not None}
     writer = None if trace is None else _open_trace(trace)
     try:
-        configured = _configured(arguments)
+        configured = arguments if arguments.get("ignore_config") else configuration(arguments)
         bus = _open_in_time(_completed(arguments, configured), configured.get("interface"))
     except (can.CanError, OSError, ValueError, NotImplementedError, ImportError, TypeError) as error:
         if writer is not None:
             writer.stop()
+        if isinstance(error, ConfigError):
+            raise
         raise _open_failure(arguments, error) from error
     return Connection(bus, writer=writer)
 
@@ -94,13 +96,19 @@ def _open_in_time(arguments: dict[str, Any], interface: str | None) -> can.BusAB
         socket.setdefaulttimeout(before)
 
 
-def _configured(arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return the arguments with what python-can's own configuration adds."""
-    configured = dict(arguments)
-    if not arguments.get("ignore_config"):
-        with contextlib.suppress(can.CanInterfaceNotImplementedError):
-            configured = can.util.load_config(config=configured)
-    return configured
+def configuration(typed: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is typed with what python-can's own files and environment add; raises ConfigError: a damaged file."""
+    try:
+        return dict(can.util.load_config(config=dict(typed)))
+    except can.CanInterfaceNotImplementedError:
+        return dict(typed)
+    except (configparser.Error, UnicodeDecodeError) as error:
+        raise ConfigError(
+            f"python-can's configuration cannot be read: {reason(error)}",
+            where=str(getattr(error, "source", "can.conf, can.ini or .canrc")),
+            likely="a missing bracket or equals sign",
+            hint="a section [default] has lines like `interface = socketcan`",
+        ) from None
 
 
 def _completed(arguments: dict[str, Any], configured: dict[str, Any]) -> dict[str, Any]:

@@ -271,9 +271,9 @@ def _erase_memory(bus: BusOptions, out: Output) -> None:
 
     channel = bus.channel
     if channel is None and bus.interface is None:
-        import can
+        from pmsmtool.bus.connect import configuration
 
-        channel = can.util.load_config().get("channel")
+        channel = configuration({}).get("channel")
     for path in erase_memory(None if channel is None else str(channel)):
         out.detail(f"erased {path}: the simulated drive starts from factory memory")
 

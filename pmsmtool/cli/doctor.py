@@ -95,12 +95,12 @@ def _examined(bus: BusOptions, find_bitrate: bool, listen_s: float) -> tuple[dic
 
 def _configuration(bus: BusOptions) -> dict[str, Any]:
     """Return what python-can will use, from options, files and environment."""
-    import can
+    from pmsmtool.bus.connect import configuration
 
     typed = {key: value for key, value in bus.recorded.items() if value is not None}
     try:
-        loaded = can.util.load_config(config=dict(typed))
-    except (can.CanError, ValueError):
+        loaded = configuration(typed)
+    except ValueError:
         return typed
     return {key: loaded.get(key) for key in bus.recorded if loaded.get(key) is not None}
 

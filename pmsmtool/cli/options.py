@@ -280,12 +280,9 @@ class BusOptions:
         """Whether the bus is the simulated drive in this process; only then nothing real can move."""
         if self.interface is not None:
             return self.interface == SIMULATED_INTERFACE
-        import can
+        from pmsmtool.bus.connect import configuration
 
-        try:
-            return bool(can.util.load_config().get("interface") == SIMULATED_INTERFACE)
-        except can.CanInterfaceNotImplementedError:
-            return False
+        return bool(configuration({}).get("interface") == SIMULATED_INTERFACE)
 
     @property
     def recorded(self) -> dict[str, Any]:

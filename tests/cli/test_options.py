@@ -163,3 +163,12 @@ def test_a_served_drive_on_another_port_is_joined_by_a_file_that_python_can_read
     said = _how_to_join("127.0.0.1", 29700)
     assert "`host = 127.0.0.1` and `port = 29700` below `[default]` in ~/can.conf" in said
     assert _how_to_join("127.0.0.1", 29536).endswith("pmsmtool -i socketcand -c vcan0 scan")
+
+
+@pytest.mark.parametrize("command", [("info",), ("commission", "interior-2k2", "--yes"), ("doctor",)])
+def test_a_damaged_can_conf_is_named(tool: Tool, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]) -> None:
+    """The file is written by hand (docs/your-drive.md, 3); a missing bracket was an internal error."""
+    monkeypatch.setattr("can.util.CONFIG_FILES", ["can.conf"])
+    Path("can.conf").write_text("[default\ninterface = pmsmsim\n", encoding="utf-8")
+    code, _, err = tool(*command)
+    assert code == 2 and "a missing bracket" in err and "can.conf" in err, err
