@@ -428,6 +428,9 @@ def test_a_row_that_this_drive_of_the_family_lacks_ends_no_dump(tool: Tool) -> N
     code, said, told = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "param", "dump", "--all")
     assert code == 0 and "profile_speed_rpm = " in said
     assert "left out: motor.pole_pairs 0x2350:03: the drive has no such object" in told
+    code, said, _ = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "param", "get", "0x2333:01", "--json")
+    held = bytes.fromhex(json.loads(said)["parameters"][0]["bytes"])
+    assert code == 0 and int.from_bytes(held, "little") == 6080, "the rehearsed motor's current (mA), 0 before"
 
 
 def test_the_file_of_a_known_family_needs_no_map_and_that_of_an_unknown_one_is_told_so(tool: Tool) -> None:

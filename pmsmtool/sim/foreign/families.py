@@ -204,7 +204,7 @@ FAMILIES: Sequence[Family] = (
     Family("Copley", ((0x2110, 0), (0x2111, 0), (0x6410, 34)), _copley, (0xAB, 0x20B), serial=(0x6510, 1)),
     Family("Nanotec", ((0x2030, 0), (0x2031, 0), (0x203B, 1)), _nanotec),
     Family(
-        "Faulhaber", ((0x2333, 1), (0x2350, 3)), _faulhaber, speed_per_rps=60.0,
+        "Faulhaber", ((0x2333, 1), (0x2333, 2)), _faulhaber, speed_per_rps=60.0,
         speed_source="rpm: its largest profile velocity is 30000",
     ),
     Family("ZeroErr", ((0x2240, 0), (0x2241, 0), (0x3B69, 0)), _none, per_turn=524_288),
