@@ -326,7 +326,7 @@ def test_a_maker_whom_no_map_names_is_not_told_of_another_map(tool: Tool) -> Non
     assert code == 2 and "no map names this drive: vendor 0x000001dd" in said and "pmsmsim" not in said
     assert "the maker's own tool" in said and "`pmsmtool restore --other-drive`" in said
     code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes", "prove", "design.toml")
-    assert code == 9 and "needs set-points for d and q" in said and "`pmsmtool commission` runs every stage" in said
+    assert code == 9 and "needs set-points for d and q" in said and "`pmsmtool commission` runs what it allows" in said
     code, _, said = tool(
         "--sim", "interior-2k2?nv=:memory:&eds=known.eds", "--yes", "prove", "design.toml", "--map", "epos4"
     )
