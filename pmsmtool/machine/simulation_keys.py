@@ -222,8 +222,9 @@ def simulation_of(machine: MachineParameters, encoder_bits: int | None) -> tuple
     table |= {"adc_full_scale_apk": full_scale, "sensor_noise_apk": NOISE_SHARE * full_scale}
     assumed.append(f"current measurement to {format_quantity(full_scale, 'A', 3)} peak, noise {NOISE_SHARE:g} of it")
     torque = torque_per_ampere(machine.pole_pairs, machine.psi_f_wb) * rated
-    table["tau_c_nm"] = FRICTION_SHARE * torque
-    assumed.append(f"Coulomb friction {100.0 * FRICTION_SHARE:g} % of the rated torque")
+    if machine.tau_c_nm is None:
+        table["tau_c_nm"] = FRICTION_SHARE * torque
+        assumed.append(f"Coulomb friction {100.0 * FRICTION_SHARE:g} % of the rated torque")
     if machine.J_kgm2 is None:
         table["J_kgm2"] = torque / ACCELERATION_RAD_S2
         assumed.append(f"inertia: {ACCELERATION_RAD_S2:g} rad/s2 under rated torque (none is given)")

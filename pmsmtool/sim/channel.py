@@ -239,6 +239,18 @@ def _kernel(machine_file: MachineFile, seed: int) -> DriveCore:
     return create(machine_file, seed)
 
 
+def simulated_machine_file(channel: Channel) -> MachineFile:
+    """Return the machine of a channel; without [simulation] (by hand, by identify) with what `machine new` assumes."""
+    from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.machine.simulation_keys import simulation_of
+    from pmsmtool.sim.simulated_machine import with_simulation
+
+    found = load_machine_file(machine_path(channel.name))
+    if not found.simulation:
+        found = replace(found, simulation=simulation_of(found.machine, found.encoder.bits)[0])
+    return with_simulation(found, channel.simulation)
+
+
 @next_step(NEXT_STEP)
 def build_line(
     channel: Channel, *, bitrate: int | None = None, instant: bool = False, make_core: CoreMaker = _kernel
@@ -259,16 +271,13 @@ def build_line(
     make_core : callable
         Makes the application with its machine: ``(machine file, seed)``.
     """
-    from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.sim.simulated_machine import with_simulation
-
     first = DEFAULT_NODE_ID if channel.node is None else channel.node
     if first != UNCONFIGURED and first + channel.nodes - 1 > LARGEST_NODE_ID:
         raise ConfigError(
             f"node ids {first} .. {first + channel.nodes - 1} exceed {LARGEST_NODE_ID}", where=f"channel {channel.name}"
         )
     path = machine_path(channel.name)
-    machine_file = with_simulation(load_machine_file(path), channel.simulation)
+    machine_file = simulated_machine_file(channel)
     face = _face(channel, machine_file)
     plan = None if channel.faults is None else load_faults(channel.faults)
     seed = int(machine_file.simulation.get("seed", 0)) if channel.seed is None else channel.seed  # type: ignore[arg-type]

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.resources import data_folder
-from pmsmtool.sim.channel import erase_memory
+from pmsmtool.sim.channel import erase_memory, parse_channel, simulated_machine_file
 
 
 @pytest.fixture
@@ -51,3 +52,17 @@ def test_a_channel_that_cannot_be_used_erases_nothing(memory: Path) -> None:
     with pytest.raises(ConfigError, match="interior-2k"):
         erase_memory("interior-2k")
     assert len(list(memory.iterdir())) == 5
+
+
+def test_a_machine_file_by_hand_has_the_sensors_that_machine_new_assumes(tmp_path: Path) -> None:
+    """Without noise its current measurement was refused, and without friction a light one had an open phase."""
+    path = tmp_path / "hand.toml"
+    path.write_text(
+        'schema = "pmsmtool.machine/1"\nname = "hand"\n[machine]\npole_pairs = 5\nR_s_ohm = 0.93\nL_d_h = 0.0026\n'
+        "L_q_h = 0.0026\npsi_f_wb = 0.0471\nI_nom_apk = 3.96\n[inverter]\nU_dc_v = 310\nf_s_hz = 16000\n"
+    )
+    assumed = simulated_machine_file(parse_channel(f"{path}?phase_open=a")).simulation
+    assert float(assumed["sensor_noise_apk"]) > 0.0 and float(assumed["tau_c_nm"]) > 0.0  # type: ignore[arg-type]
+    assert assumed["phase_open"] == "a"
+    shipped = simulated_machine_file(parse_channel("interior-2k2")).simulation
+    assert shipped == load_machine_file("interior-2k2").simulation
