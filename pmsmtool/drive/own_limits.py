@@ -73,10 +73,14 @@ def lower_limits(drive: CanopenDrive, envelope: Envelope) -> OwnLimits:
     current = _lowered(node, current_limits(node, rated), envelope.i_max_apk, refused)
     speed = _lowered(node, speed_limits(node), rpm_from_rad_s(envelope.speed_max_rad_s), refused)
     if not (current and speed) and not drive.commands_bounded_current:
+        lacking = [
+            name for found, name in ((current, "current (0x6073, 0x6072)"), (speed, "speed (0x6080)")) if found is None
+        ]
         raise NotAvailable(
-            "the drive has no current and speed limit of its own (0x6073, 0x6075, 0x6080)",
+            "; ".join([f"the drive keeps no limit of its own of its {' and its '.join(lacking)}", *refused]),
             where=f"node {node.node}",
-            hint="without them nothing is moved",
+            hint="without it nothing is moved but by a current that this program commands; where the maker has another "
+            "object for it, name that in [motion] of a map (current_limit, speed_limit)",
         )
     return OwnLimits(
         None if current is None else current[0],

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -229,8 +230,8 @@ RATED_APK = 4.0 * math.sqrt(2.0)
         ({objects.MAX_CURRENT_PERMILLE: 3000, objects.MAX_SPEED_RPM: 6000}, False, ("0x6073", 531), ("0x6080", 955)),
         ({objects.MAX_CURRENT_PERMILLE: 500, objects.MAX_SPEED_RPM: 900}, False, ("0x6073", 500), ("0x6080", 900)),
         ({MAX_TORQUE_PERMILLE: 3000}, True, ("0x6072", 531), None), ({}, True, None, None),
-        ({objects.MAX_CURRENT_PERMILLE: 3000}, False, "lacks", None),
-        ({objects.MAX_SPEED_RPM: 6000}, False, "lacks", None),
+        ({objects.MAX_CURRENT_PERMILLE: 3000}, False, "lacks", r"of its speed \(0x6080\)$"),
+        ({objects.MAX_SPEED_RPM: 6000}, False, "lacks", r"of its current \(0x6073, 0x6072\)$"),
     ],
 )  # fmt: skip
 def test_the_drives_own_limits_are_lowered_to_the_envelope(more: Held, bounded: bool, current: Any, speed: Any) -> None:
@@ -239,8 +240,9 @@ def test_the_drives_own_limits_are_lowered_to_the_envelope(more: Held, bounded: 
         drive: Any = SimpleNamespace(node=node, commands_bounded_current=bounded, shows_apk=math.inf)
         envelope = Envelope(i_max_apk=3.0, speed_max_rad_s=100.0)
         if current == "lacks":
-            with pytest.raises(NotAvailable, match="no current and speed limit"):
+            with pytest.raises(NotAvailable) as caught:
                 lower_limits(drive, envelope)
+            assert re.search(speed, caught.value.what), "the limit that it has is not named"
             return
         found = lower_limits(drive, envelope)
         for quantity, most, expected, unit in (
