@@ -23,6 +23,7 @@ import numpy as np
 from numpy.polynomial.legendre import Legendre, legvander
 
 from pmsmtool.arrays import Array
+from pmsmtool.estimators.least_squares import linear_solve
 
 ENCODER_ORDERS = (1, 2)
 """Orders that are the encoder's: mounted off centre, and oval."""
@@ -123,7 +124,9 @@ def _smooth(t_s: Array, theta: Array) -> tuple[Array, Array]:
     return np.asarray(fit(t_s)), np.asarray(fit.deriv()(t_s))
 
 
-def angle_harmonics(coastings: Sequence[tuple[Array, Array, Array]], step_rad: float = 0.0) -> AngleHarmonics:
+def angle_harmonics(
+    coastings: Sequence[tuple[Array, Array, Array]], step_rad: float = 0.0, most_rad_s2: float = math.inf
+) -> AngleHarmonics:
     """Return what repeats with the angle; nothing where the shaft turned too little.
 
     Parameters
@@ -132,6 +135,8 @@ def angle_harmonics(coastings: Sequence[tuple[Array, Array, Array]], step_rad: f
         Times (s), positions along the phase order (rad, unwrapped) and their standard deviations (rad) of each trace.
     step_rad : float
         Step of the position (rad).
+    most_rad_s2 : float
+        Largest acceleration by torque that a shaft may have which pushes turned; more is no torque, but a line's error.
     """
     used = [(fast_part(t, theta), t, theta, std) for t, theta, std in coastings]
     parts = [(t[:n], theta[:n], std[:n]) for n, t, theta, std in used]
@@ -161,20 +166,19 @@ def angle_harmonics(coastings: Sequence[tuple[Array, Array, Array]], step_rad: f
     pairs = {what: pair(*what) for what in looked_for}
     unit = {what: np.linalg.qr(columns)[0] for what, columns in pairs.items()}
     chosen: list[tuple[int, str]] = []
-    fit, std = np.empty(0), np.empty(0)
-    rest = left
+    fit, std, rest = np.empty(0), np.empty(0), left
     while len(chosen) < ORDERS_MOST:
         power = {what: float(np.sum((rest @ unit[what]) ** 2)) for what in pairs if what not in chosen}
         best = max(power, key=lambda what: power[what])
         matrix = np.concatenate([pairs[what] for what in (*chosen, best)], axis=1)
-        scale = np.linalg.norm(matrix, axis=0)
-        found = np.linalg.lstsq(matrix / scale, left, rcond=None)[0] / scale
-        after = left - matrix @ found
+        found, covariance, after, _ = linear_solve(matrix, left, np.ones(len(left)))
         dof = len(left) - DEGREE * len(parts) - matrix.shape[1]
-        covariance = np.linalg.inv((matrix / scale).T @ (matrix / scale)) * float(after @ after) / dof
-        deviation = np.sqrt(np.diag(covariance)) / scale
+        deviation = np.sqrt(np.diag(covariance) * float(after @ after) / dof)
         if math.hypot(*found[-2:]) < SURE * max(deviation[-2:]):
             break
+        if best[1] == TORQUE and math.hypot(*found[-2:]) > most_rad_s2:
+            del pairs[best]
+            continue
         chosen, fit, std, rest = [*chosen, best], found, deviation, after
 
     def found_of(wanted: str) -> tuple[Harmonic, ...]:

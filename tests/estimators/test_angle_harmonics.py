@@ -117,6 +117,18 @@ def test_the_error_of_an_interpolation_is_found_with_its_lines() -> None:
     assert not found.encoder_rad and not found.acceleration_rad_s2
 
 
+def test_a_torque_that_would_have_held_the_shaft_is_an_error_of_the_lines() -> None:
+    """A speed that falls little does not tell them apart: 128 lines were a cogging of 63 times the push's torque."""
+    once, most = 1e-3, 100.0
+    traces = [(t[:200], shown[:200]) for t, shown in braked(lambda way: once * np.sin(128 * way), STEP)]
+    shown = [(t, way, position_std(way, STEP)) for t, way in traces]
+    (held,) = angle_harmonics(shown, STEP).acceleration_rad_s2
+    assert held.order == 128 and held.amplitude > most  # measured: 6.3e4
+    found = angle_harmonics(shown, STEP, most)
+    assert [h.order for h in found.line_rad] == [128, 256] and not found.acceleration_rad_s2
+    assert found.line_rad[0].amplitude == pytest.approx(once, rel=LINE_TOLERANCE)
+
+
 def test_the_steps_of_a_position_are_no_lines() -> None:
     step = 2.0 * math.pi / 2**12
     traces = braked(lambda way: 0.0 * way, step)

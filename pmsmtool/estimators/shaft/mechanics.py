@@ -82,6 +82,7 @@ machine has 0.0035 to 0.0039."""
 NOISY_TORQUE = "cogging, a load or a gear on the shaft, an elastic coupling, an encoder that is off centre"
 SCALE_FLOOR = 3e-4
 """Relative deviation of the torque's scale beyond that of flux linkage and displaced samples."""
+HELD = 1.4  # cogging, of a push's torque, that holds a rotor at rest: a pendulum goes over from 0.725 of its weight on
 NO_HARMONICS = AngleHarmonics()
 MEAN_STD = 0.04
 """Relative standard deviation of the inertia by mean accelerations: six shafts with play were 0.1 to 1.6 % off."""
@@ -194,7 +195,10 @@ def estimate_mechanics(
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
     step = encoder_step([run["theta_M_rad"] for run in runs])
     coasted = [(run.t_s, direction * run["theta_M_rad"]) for run in runs if run.meta["coasting"]]
-    harmonics = angle_harmonics([(t_s, theta, position_std(theta, step)) for t_s, theta in coasted], step)
+    pushed = [(run, max(2, len(run) // 40)) for run in runs if not run.meta["coasting"]]
+    changes = [np.diff(run["theta_M_rad"][::k], 2) / (k * run.period_s) ** 2 for run, k in pushed]
+    most = HELD * max((float(np.max(np.abs(change), initial=0.0)) for change in changes), default=math.inf)
+    harmonics = angle_harmonics([(t_s, theta, position_std(theta, step)) for t_s, theta in coasted], step, most)
     coasting = {h.order: h for h in harmonics.encoder_rad}
     prior = [replace(coasting.get(h.order, h), std=h.std) for h in encoder_prior(encoder, pole_pairs)]
     known = replace(harmonics, encoder_rad=tuple(prior))
@@ -220,8 +224,6 @@ def estimate_mechanics(
         return blocks, *_fit(blocks, start, elastic)
 
     blocks, with_drag, chi2, noisy = _explained(fitted, runs)
-    noise = _noise(noisy)
-    unexplained = _unexplained(blocks, noisy)
     # where the other parameters would lead without the drag: left as they are, they may be too far off for a fit
     others, of_it = np.delete(with_drag.jacobian, SHAFT, axis=1), with_drag.jacobian[:, SHAFT] * with_drag.x[SHAFT]
     start = np.delete(with_drag.x, SHAFT) + np.linalg.lstsq(others, of_it, rcond=None)[0]
@@ -237,16 +239,14 @@ def estimate_mechanics(
     # 76 N m at the rated speed of a shaft with 1 N m of friction; a drag below zero would turn it (2.2 N m, ten times
     # the friction, at 13 times the speed of the pushes). Neither model is the shaft's
     falls = with_drag.x[1] < -COVERAGE_FACTOR * widen * float(of_drag[1])
-    if falls or with_drag.x[SHAFT] < 0.0:
-        share = min(share, 0.5)
+    share = min(share, 0.5) if falls or with_drag.x[SHAFT] < 0.0 else share
     values, deviations = [], []
     for k in range(SHAFT):
         pair = without.x[k], with_drag.x[k]
-        mean = (1.0 - share) * pair[0] + share * pair[1]
-        parts = (float(bound[k]) ** 2, float(of_drag[k]) ** 2)
+        own = (1.0 - share) * float(bound[k]) ** 2 + share * float(of_drag[k]) ** 2
         spread = share * (1.0 - share) * float(pair[1] - pair[0]) ** 2
-        values.append(float(mean))
-        deviations.append(widen * math.sqrt((1.0 - share) * parts[0] + share * parts[1] + spread))
+        values.append(float((1.0 - share) * pair[0] + share * pair[1]))
+        deviations.append(widen * math.sqrt(own + spread))
     J, B, tau_c = math.exp(values[0]), values[1], values[2]
     stds = (J * deviations[0], deviations[1], deviations[2])
     require_useful(noisy, stds[1], stds[2])
@@ -260,7 +260,7 @@ def estimate_mechanics(
                  method=METHOD)
         for value, std, unit in zip((J, B, tau_c), stds, MEANS.values(), strict=True)
     ]  # fmt: skip
-    ripple = max(noise.values())
+    ripple, unexplained = max(_noise(noisy).values()), _unexplained(blocks, noisy)
     J_found, B_found, tau_found = estimates
     return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, unexplained, harmonics, drag)
 

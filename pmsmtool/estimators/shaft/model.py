@@ -103,13 +103,9 @@ class Problem:
         except OverflowError:
             return np.full(len(shown), np.nan)
 
-    def of_run(self, k: int, x: Array) -> Array:
-        """Whitened residual of one trace."""
-        return np.asarray(self.factors[k] @ self._off(k, x))
-
     def residual(self, x: Array) -> Array:
         """Whitened residual of the traces, one after the other, and of the disturbances, shape (n,)."""
-        return np.concatenate([*(self.of_run(k, x) for k in range(len(self.runs))), x[self.sizes]])
+        return np.concatenate([*(factor @ self._off(k, x) for k, factor in enumerate(self.factors)), x[self.sizes]])
 
     def jacobian(self, x: Array) -> Array:
         """Its derivative, shape (n, k); one-sided for the disturbances, which hardly bend it."""
