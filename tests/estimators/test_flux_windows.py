@@ -42,7 +42,7 @@ from pmsmtool.estimators.flux.linkage_rows import (
     corrected,
     mean_inverter_error,
     pairs_of,
-    unlimited,
+    usable,
 )
 from pmsmtool.estimators.injection.sampling_instant import Sampling, course_s2, sampled_ripple
 from pmsmtool.estimators.injection.switching_ripple import Modulation, rippled_error_dq_v
@@ -113,54 +113,66 @@ def test_a_window_belongs_to_one_pair() -> None:
     assert pairs_of(speeds) == [(1, 2), (3, 4)]
 
 
-def _checked(**signals: Array) -> None:
-    trace = _changed(_windows(), **signals)
-    check_speeds(trace, pairs_of(trace))
+def _checked(**signals: Array) -> str:
+    whole = _changed(_windows(), **signals)
+    left, told = usable(whole)
+    check_speeds(whole, pairs_of(left), left["omega_e_rad_s"])
+    return told
 
 
 def test_a_run_needs_four_pairs_each_way_over_speeds_that_differ() -> None:
     trace = _windows()
     w = trace["omega_e_rad_s"]
-    check_speeds(trace, pairs_of(trace))
+    assert _checked() == ""
     for sign, name in ((1.0, "forward"), (-1.0, "backward")):
         for ratio in (SPEED_RATIO, 0.99 * SPEED_RATIO):
             speed = np.where(w * sign > 0.0, sign * np.clip(np.abs(w), 170.0, ratio * 170.0), w)
             refused = pytest.raises(IdentificationError, match=f"E_EXCITATION: 4 pairs of d currents {name}")
             with nullcontext() if ratio == SPEED_RATIO else refused:
-                _checked(omega_e_rad_s=speed)
+                _checked(omega_e_rad_s=speed, omega_first_rad_s=speed, omega_second_rad_s=speed)
         gone = int(np.argmax(w * sign == 170.0))
         with pytest.raises(IdentificationError, match=f"E_EXCITATION: 3 pairs of d currents {name}"):
             _checked(i_d_a=np.where(np.arange(len(w)) == gone, 0.0, trace["i_d_a"]))
 
 
 def test_a_speed_or_a_current_that_moves_is_told_where_and_by_how_much() -> None:
+    """All windows of one direction are lost where the worst of them moves most."""
     trace = _windows()
-    w, at = trace["omega_e_rad_s"], np.arange(len(trace)) == 2
-    for share in (0.4, 0.41):
+    w = trace["omega_e_rad_s"]
+    more = (w > 0.0) * (1.0 + 0.01 * (np.arange(len(trace)) == 2))
+    for share in (0.39, 0.41):
         refused = pytest.raises(
             IdentificationError, match="at 230 rad/s the speed moves by 41 % in one window, limit 40 %"
         )
-        with nullcontext() if share == 0.4 else refused:
-            _checked(omega_second_rad_s=w + at * share * w, omega_first_rad_s=w)
+        with nullcontext() if share == 0.39 else refused:
+            _checked(omega_second_rad_s=w + more * share * w, omega_first_rad_s=w)
     largest = math.hypot(4.0, 0.2)
     for axis in ("i_d", "i_q"):
         moved = trace[f"{axis}_first_a"]
         for share in (0.98, 1.05):
             refused = pytest.raises(IdentificationError, match=f"at 230 rad/s {axis} moves by 1.1 A .*limit 1 A")
             with nullcontext() if share < 1.0 else refused:
-                _checked(**{f"{axis}_second_a": moved - at * share * CURRENT_SETTLE_LIMIT * largest})
+                _checked(**{f"{axis}_second_a": moved - more * share * CURRENT_SETTLE_LIMIT * largest})
 
 
-def test_of_a_pair_with_a_limited_window_none_is_left() -> None:
-    flagged = np.zeros(20)
-    whole = _changed(_windows(), flagged=flagged)
-    assert np.array_equal(unlimited(whole)["u_q_v"], whole["u_q_v"])
+def test_of_a_pair_with_a_window_that_is_limited_or_moves_none_is_left() -> None:
+    """One window in which an encoder's error moved i_d lost psi and mechanics of a whole run."""
+    whole = _changed(_windows(), flagged=np.zeros(20))
+    assert np.array_equal(usable(whole)[0]["u_q_v"], whole["u_q_v"])
     (first, second), alone = pairs_of(whole)[1], next(k for k in range(20) if all(k not in p for p in pairs_of(whole)))
-    kept = unlimited(_changed(whole, flagged=np.where(np.isin(np.arange(20), (second, alone)), 2.0, 0.0)))
-    assert np.array_equal(kept["u_q_v"], np.delete(whole["u_q_v"], [first, second, alone]))
-    assert len(kept.t_s) == len(kept) == 17
+    bad = np.isin(np.arange(20), (second, alone))
+    moved = whole["i_d_first_a"] + 3.0 * bad
+    for change, why in (
+        ({"flagged": 2.0 * bad}, "limited by voltage or current"),
+        ({"i_d_second_a": moved}, "not settled"),
+        ({"flagged": 2.0 * bad, "i_d_second_a": moved}, "limited by voltage or current or not settled"),
+    ):
+        kept, told = usable(_changed(whole, **change))
+        assert np.array_equal(kept["u_q_v"], np.delete(whole["u_q_v"], [first, second, alone]))
+        assert len(kept.t_s) == len(kept) == 17
+        assert told == f"3 of 20 windows left out, {why}"
     with pytest.raises(IdentificationError, match="E_CLIPPED: voltage or current limited in 17 windows"):
-        check_speeds(kept, [], 17)
+        _checked(flagged=1.0 * (np.arange(20) < 17))
 
 
 # ---- what is taken off ------------------------------------------------------------------------------------------

@@ -34,7 +34,7 @@ from pmsmtool.estimators.flux.linkage_rows import (
     corrected,
     fastest_pair,
     pairs_of,
-    unlimited,
+    usable,
 )  # fmt: skip
 from pmsmtool.estimators.injection.sampling_instant import CoastingPairs, Sampling, ShownInstant, shown_instant
 from pmsmtool.estimators.injection.switching_ripple import Modulation
@@ -175,10 +175,9 @@ def estimate_flux_linkage(
         Reference temperature (degC) and coefficient of the magnets (1/K).
     """
     tolerance = tolerance or SensorTolerance()
-    windows, speeds = len(speeds), unlimited(speeds)
-    limited = windows - len(speeds)
+    whole, (speeds, left_out) = speeds, usable(speeds)
     pairs = pairs_of(speeds)
-    check_speeds(speeds, pairs, limited)
+    check_speeds(whole, pairs, speeds["omega_e_rad_s"])
     rows = corrected(speeds, R_ohm, period_s, inverter, modulation, lag_s, sampling)
     d_fit, d_std, d_dof = _fit_d(rows)
     even = _fit_even(rows, pairs)
@@ -235,7 +234,7 @@ def estimate_flux_linkage(
         method="coasting in both directions, d currents of both signs, sampled-data correction",
         i_d_apk=0.0,
         i_q_apk=0.0,
-        fallback=f"{limited} of {windows} windows left out, limited by voltage or current" if limited else "",
+        fallback=left_out,
         dof=even.dof * (std / fitted) ** 4 if fitted > 0.0 else math.inf,  # Welch-Satterthwaite, GUM G.4
     )
     if driven is not None and not apart and std > WIDE * psi:

@@ -177,53 +177,54 @@ def mean_inverter_error(
     return np.asarray(np.stack(error).reshape(2, n, ANGLES).mean(axis=2))
 
 
-def unlimited(speeds: Trace) -> Trace:
-    """Return the windows in which nothing was limited; of two with d currents of both signs, both or none."""
-    if "flagged" not in speeds.signals:
-        return speeds
-    limited = speeds["flagged"] > 0.0
+def usable(speeds: Trace) -> tuple[Trace, str]:
+    """Return the windows in which nothing was limited or moved, of two with d currents of both signs both or none.
+
+    And a word about the others: an encoder's error turns the frame, and moves currents within a part of a turn.
+    """
+    limited = speeds["flagged"] > 0.0 if "flagged" in speeds.signals else np.zeros(len(speeds), bool)
+    moved = np.any([change > limit for change, limit, *_ in _changes(speeds)], axis=0)
+    left_out = limited | moved
     for pair in map(list, pairs_of(speeds)):
-        limited[pair] = np.any(limited[pair])
+        left_out[pair] = np.any(left_out[pair])
     kept: Any = copy.copy(speeds.signals)  # those of a file name it where one is missing
     for name, values in speeds.signals.items():
-        kept[name] = values[~limited]
-    return replace(speeds, t_s=speeds.t_s[~limited], signals=kept)
+        kept[name] = values[~left_out]
+    whys = ("limited by voltage or current",) * bool(np.any(limited)) + ("not settled",) * bool(np.any(moved))
+    told = f"{np.sum(left_out)} of {len(speeds)} windows left out, {' or '.join(whys)}" if whys else ""
+    return replace(speeds, t_s=speeds.t_s[~left_out], signals=kept), told
 
 
-def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]], limited: int = 0) -> None:
-    """Refuse a run that is not settled, or that has too few speeds, as where ``limited`` windows were left out.
+def check_speeds(whole: Trace, pairs: Sequence[tuple[int, int]], w: Array) -> None:
+    """Refuse a run that has too few speeds ``w`` in usable pairs of windows, by what the ``whole`` run shows.
 
     Raises IdentificationError: ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``.
     """
-    w = speeds["omega_e_rad_s"]
     for sign, name in ((1.0, "forward"), (-1.0, "backward")):
         mine = np.array([abs(w[k]) for k, _ in pairs if np.sign(w[k]) == sign])
-        if len(mine) < MINIMUM_PAIRS or float(np.max(mine)) < SPEED_RATIO * float(np.min(mine)):
-            if limited:
-                raise refuse("E_CLIPPED", f"voltage or current limited in {limited} windows", stage=STAGE)
-            raise refuse(
-                "E_EXCITATION",
-                f"{len(mine)} pairs of d currents {name}; {MINIMUM_PAIRS} over speeds of {SPEED_RATIO:g} to 1 are "
-                "needed",
-                stage=STAGE,
-            )
-    change = np.abs(speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / np.abs(w)
-    _check_settled(w, 100.0 * change, 100.0 * SETTLE_LIMIT, "the speed", "%", STOPPED, STOPPED_STEP)
-    limit = CURRENT_SETTLE_LIMIT * float(np.max(np.hypot(speeds["i_d_a"], speeds["i_q_a"])))
-    for axis in ("i_d", "i_q"):
-        _check_settled(w, np.abs(speeds[f"{axis}_second_a"] - speeds[f"{axis}_first_a"]), limit, axis, "A")
-
-
-def _check_settled(
-    w: Array, moved: Array, limit: float, what: str, unit: str, likely: str = "", hint: str = ""
-) -> None:
-    worst = int(np.argmax(moved))
-    if moved[worst] > limit:
+        if len(mine) >= MINIMUM_PAIRS and float(np.max(mine)) >= SPEED_RATIO * float(np.min(mine)):
+            continue
+        limited = np.sum(whole["flagged"] > 0.0) if "flagged" in whole.signals else 0
+        if limited:
+            raise refuse("E_CLIPPED", f"voltage or current limited in {limited} windows", stage=STAGE)
+        for change, limit, what, unit, likely, hint in _changes(whole):
+            worst = int(np.argmax(change))
+            if change[worst] > limit:
+                told = f"{what} moves by {change[worst]:.2g} {unit} in one window, limit {limit:.2g} {unit}"
+                where = f"at {whole['omega_e_rad_s'][worst]:.4g} rad/s {told}"
+                raise refuse("E_NOT_SETTLED", where, stage=STAGE, likely=likely, hint=hint)
         raise refuse(
-            "E_NOT_SETTLED",
-            f"at {w[worst]:.4g} rad/s {what} moves by {moved[worst]:.2g} {unit} in one window, "
-            f"limit {limit:.2g} {unit}",
+            "E_EXCITATION",
+            f"{len(mine)} pairs of d currents {name}; {MINIMUM_PAIRS} over speeds of {SPEED_RATIO:g} to 1 are needed",
             stage=STAGE,
-            likely=likely,
-            hint=hint,
         )
+
+
+def _changes(speeds: Trace) -> list[tuple[Array, float, str, str, str, str]]:
+    """Return the changes between the halves of the windows, their limit, name, unit, likely cause and next step."""
+    speed = np.abs(speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / np.abs(speeds["omega_e_rad_s"])
+    limit = CURRENT_SETTLE_LIMIT * float(np.max(np.hypot(speeds["i_d_a"], speeds["i_q_a"])))
+    currents = [
+        (np.abs(speeds[f"{k}_second_a"] - speeds[f"{k}_first_a"]), limit, k, "A", "", "") for k in ("i_d", "i_q")
+    ]
+    return [(100.0 * speed, 100.0 * SETTLE_LIMIT, "the speed", "%", STOPPED, STOPPED_STEP), *currents]
