@@ -144,11 +144,19 @@ def angle_harmonics(
     if not parts:
         return AngleHarmonics()
     turns = min(float(np.ptp(theta)) for _, theta, _ in parts) / (2.0 * math.pi)
-    smooth = [(*_smooth(t, theta), std) for t, theta, std in parts]
-    slow = [legvander(np.linspace(-1.0, 1.0, len(t)), DEGREE) / std[:, None] for t, _, std in parts]
-    bases = [np.linalg.qr(columns)[0] for columns in slow]
-    left = np.concatenate([_without(basis, theta / std) for basis, (_, theta, std) in zip(bases, parts, strict=True)])
     lowest = math.ceil(DEGREE / turns)  # slower ones are the polynomial's
+    smooth, bases = [], []
+    for t, theta, std in parts:
+        courses, error = legvander(np.linspace(-1.0, 1.0, len(t)), DEGREE), np.zeros_like(theta)
+        for _ in range(SHAFT_STEPS):
+            angle, speed = _smooth(t, theta - error)
+            waves = np.column_stack([wave(order * angle) for order in ENCODER_ORDERS for wave in (np.cos, np.sin)])
+            error = waves @ np.linalg.lstsq(np.column_stack([courses, waves]), theta, rcond=None)[0][DEGREE + 1 :]
+        smooth.append((angle, speed, std))
+        # what the polynomial leaves of an encoder's error that is as slow is no torque
+        hidden = waves[:, : 2 * sum(order < lowest for order in ENCODER_ORDERS)]
+        bases.append(np.linalg.qr(np.column_stack([courses, hidden]) / std[:, None])[0])
+    left = np.concatenate([_without(basis, theta / std) for basis, (_, theta, std) in zip(bases, parts, strict=True)])
 
     def pair(order: int, of: str) -> Array:
         rows = []
@@ -172,7 +180,7 @@ def angle_harmonics(
         best = max(power, key=lambda what: power[what])
         matrix = np.concatenate([pairs[what] for what in (*chosen, best)], axis=1)
         found, covariance, after, _ = linear_solve(matrix, left, np.ones(len(left)))
-        dof = len(left) - DEGREE * len(parts) - matrix.shape[1]
+        dof = len(left) - sum(basis.shape[1] for basis in bases) - matrix.shape[1]
         deviation = np.sqrt(np.diag(covariance) * float(after @ after) / dof)
         if math.hypot(*found[-2:]) < SURE * max(deviation[-2:]):
             break

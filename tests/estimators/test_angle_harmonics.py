@@ -100,10 +100,10 @@ LINE_TOLERANCE = 0.05
 """Relative, of an interpolation's error; measured: 0.017 and 0.032."""
 
 
-def braked(error: Callable[[Array], Array], step: float) -> list[tuple[Array, Array]]:
-    """Two shafts that slow down evenly, as an encoder shows them."""
+def braked(error: Callable[[Array], Array], step: float, speed: float = 1.0) -> list[tuple[Array, Array]]:
+    """Two shafts that slow down evenly, as an encoder shows them: 6.5 turns and more, times ``speed``."""
     t = RATE_S * np.arange(ROWS)
-    ways = [0.3 + start * t - 0.5 * slope * t * t for start, slope in ((65.0, 40.0), (-70.0, -45.0))]
+    ways = [0.3 + speed * (start * t - 0.5 * slope * t * t) for start, slope in ((65.0, 40.0), (-70.0, -45.0))]
     return [(t, step * np.floor((way + error(way)) / step)) for way in ways]
 
 
@@ -127,6 +127,18 @@ def test_a_torque_that_would_have_held_the_shaft_is_an_error_of_the_lines() -> N
     found = angle_harmonics(shown, STEP, most)
     assert [h.order for h in found.line_rad] == [128, 256] and not found.acceleration_rad_s2
     assert found.line_rad[0].amplitude == pytest.approx(once, rel=LINE_TOLERANCE)
+
+
+@pytest.mark.parametrize("turns", [1.5, 2.7, 5.0])
+def test_an_encoder_error_over_few_turns_is_no_torque(turns: float) -> None:
+    """1 degree once per turn, 0.5 twice: two orders of torque that are none, B 14 times the truth and tau_c below 0."""
+    for phase in (0.4, 2.0, 3.6, 5.2):
+        traces = braked(
+            lambda way, at=phase: math.radians(1.0) * np.cos(way + at) + math.radians(0.5) * np.sin(2.0 * way - at),
+            STEP,
+            turns / 6.5,
+        )
+        assert not found_in(traces).acceleration_rad_s2
 
 
 def test_the_steps_of_a_position_are_no_lines() -> None:
