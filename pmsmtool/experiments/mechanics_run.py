@@ -191,8 +191,9 @@ def _push(
         abort_speed_rad_s=abort_speed_rad_s,
     )
     drive.command_current(0.0, 0.0)
-    trace = readable(drive.record(SIGNALS, samples, decimation=decimation, excitation=excitation))
-    return replace(trace, meta={**trace.meta, "coasting": False})
+    gains = [drive.read(f"current.K_p_{axis}_v_per_a") for axis in "dq"]
+    trace = drive.record(SIGNALS, samples, decimation=decimation, excitation=excitation)
+    return readable(trace, coasting=False, K_p_v_per_a=gains)
 
 
 def _rows(drive: Drive, seconds: float, most: int) -> tuple[int, int]:

@@ -152,6 +152,9 @@ class LightShaft:
 
     def enable(self) -> None: ...
 
+    def read(self, name: str) -> float:
+        return 1.0
+
     def disable(self) -> None: ...
 
     def command_current(self, i_d: float, i_q: float) -> None: ...
