@@ -257,7 +257,7 @@ def test_a_map_without_a_co_energy_is_used_but_not_silently(
         ("machine new --name m --pole-pairs 4 --r 0.3 --l 4mH --ke 58Vrms/krpm --u-dc 540V --pwm 12kHz -o new.toml",
          "has no unit"),
         ("machine new --name m --pole-pairs 4 --r -0.3ohm --l 4mH --kt 1Nm/Arms --u-dc 540V --pwm 12kHz -o new.toml",
-         "R_s_ohm"),
+         "--r -0.3 is not above zero"),
         ("machine new --pole-pairs 1e30", "'1e30' is not a whole number"),
     ],
 )  # fmt: skip
