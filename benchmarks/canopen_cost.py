@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from pmsmtool.bus.connect import Connection
 from pmsmtool.bus.sdo import Mode, SdoChannel
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.eds import FILE_NAME
 

@@ -21,8 +21,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.key import Value
-from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_path
 from pmsmtool.papers.closed_drive import STANDARD, ClosedNode, Nodes, Seat
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.simulated_machine import with_simulation

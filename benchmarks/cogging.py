@@ -30,11 +30,11 @@ from benchmarks.real_effects import EFFECTS, truth_of
 from benchmarks.real_population import draw_real
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.files import data_folder
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.run_files import MACHINE
+from pmsmtool.identification.request import MACHINE
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.simulated_machine import settings_of
 

@@ -15,8 +15,7 @@ from pathlib import Path
 import click
 
 from pmsmtool.cli.command_table import COMMANDS, Row, Section, leaves
-from pmsmtool.cli.failure import report
-from pmsmtool.cli.main import PROGRAM, cli
+from pmsmtool.cli.main import PROGRAM, cli, report
 from pmsmtool.errors import ConfigError
 
 PAGE = "docs/commands.md"

@@ -24,9 +24,9 @@ import can
 
 from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.cli.main import run
+from pmsmtool.files import data_folder
 from pmsmtool.machine.flux_map_import import load_flux_map
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.bus import PmsmSimBus
 

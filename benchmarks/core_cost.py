@@ -39,16 +39,14 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
-from pmsmtool.commissioning.export import image_of
-from pmsmtool.commissioning.export_q import q_files
+from pmsmtool.commissioning.export import image_of, q_files
 from pmsmtool.design.governor import EPS_LEAST
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.firmware.core_binding import CORE_HEADERS, HEADER_FOLDER, core
 from pmsmtool.firmware.image import SCALAR_WORDS, pack_image
 from pmsmtool.machine.flux_map import FluxMap
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.native import parse_structs
 from tests.firmware import cortex_m
 from tests.firmware.closed_loop import (

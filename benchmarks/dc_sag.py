@@ -28,11 +28,10 @@ from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
-from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.files import data_folder
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_path
 from pmsmtool.papers.governed_drive import IDEAL
 from pmsmtool.params.parameter_set import ParameterSet
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import simulate
 from pmsmtool.sim.kernel import Application
 from pmsmtool.sim.scenarios import Scenario

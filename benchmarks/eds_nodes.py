@@ -32,8 +32,7 @@ from benchmarks.makers_drives import files_of, wrong_units
 from pmsmtool.data_types import BY_SHORT
 from pmsmtool.drive_maps.shipped_maps import family_names
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.node.objects import ObjectRow
 

@@ -38,6 +38,7 @@ from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.drive_maps.map_tables import look_up_words
 from pmsmtool.errors import PmsmtoolError
+from pmsmtool.files import data_folder
 from pmsmtool.firmware.image import crc32
 from pmsmtool.flash.journal import Entry, Snapshot, check_sum, parse_snapshot
 from pmsmtool.flash.restore import check_snapshot, restore_plan
@@ -48,12 +49,10 @@ from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, 
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.params.catalogue import layout_signature
 from pmsmtool.params.parameter_set import default_set, parse_parameter_set
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import Acceptance, Stage, new_record
 from pmsmtool.sim.faults import EXAMPLE, parse_faults
 from pmsmtool.sim.scenarios import load_scenario
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace, trace_npz
+from pmsmtool.trace import Trace, read_trace, trace_npz
 from tests.bus.frame_fuzz import transfers
 from tests.flash.rig import with_tables
 from tests.node.test_random_requests import FRAMES, test_after_any_requests_a_power_cycle_brings_a_healthy_node

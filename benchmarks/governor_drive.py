@@ -20,13 +20,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from benchmarks.simulation import bare_loop, best_ns
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.papers.governed_drive import IDEAL, PROFILE
 from pmsmtool.sim.closed_loop import image_of
-from pmsmtool.sim.kernel import Part, Simulation, Target
+from pmsmtool.sim.kernel import Part, Signal, Simulation, Target, Truth
 from pmsmtool.sim.scenarios import MODES
-from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import build_setup, with_simulation
 from pmsmtool.units import RAD_S_PER_RPM
 

@@ -19,9 +19,9 @@ from pathlib import Path
 from benchmarks.identification_coverage import evaluated, measured, truth_of
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.files import data_folder
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.resources import data_folder
 
 BASE: dict[str, Value] = {
     "inverter_model": "switched",

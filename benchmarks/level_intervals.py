@@ -47,7 +47,7 @@ from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
-from pmsmtool.experiments.supply_levels import ReadSupply, hold_supply_levels
+from pmsmtool.experiments.standstill import ReadSupply, hold_supply_levels
 from pmsmtool.identification.by_pulses import SUPPLY_LEVELS, PulseFacts, PulseResult, pulse_result
 from pmsmtool.identification.evaluate import evaluate
 from pmsmtool.identification.request import IdentifyRequest, Method
@@ -55,9 +55,8 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.measurement.by_injection import envelope_of, nameplate_of
 from pmsmtool.measurement.by_pulses import HEADROOM, push_by_torque, swing_and_record, turn_both_ways
-from pmsmtool.measurement.limits import Limits
+from pmsmtool.measurement.limits import Keep, Limits, Say
 from pmsmtool.measurement.measure import Measurement
-from pmsmtool.measurement.task import Keep, Say
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from pmsmtool.trace import Trace
 

@@ -24,15 +24,13 @@ import numpy as np
 
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.tune import tune
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.files import data_folder
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.machine.uncontrolled_generation import COLD_C
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import open_simulation
-from pmsmtool.sim.kernel import Part
+from pmsmtool.sim.kernel import Part, Truth
 from pmsmtool.sim.scenarios import Scenario
-from pmsmtool.sim.signals import Truth
 
 ALLOWED = 1.1
 """Largest voltage of the link over the nominal one."""

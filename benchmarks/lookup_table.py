@@ -30,8 +30,7 @@ from scipy.optimize import minimize
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from benchmarks.analytic_saturation import BridgeSaturation
-from pmsmtool.design.lookup.loci import STANDSTILL_V
-from pmsmtool.design.lookup.table import LookupTable, electrical_speed, speed_table, torque_limits
+from pmsmtool.design.lookup.table import STANDSTILL_V, LookupTable, electrical_speed, speed_table, torque_limits
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_import import load_flux_map

@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from unittest import mock
 
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import machine_path
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.line import Frame
 

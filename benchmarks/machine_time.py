@@ -41,8 +41,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
 from pmsmtool.estimators.resistance import R_MEASURED
-from pmsmtool.identification.request import IdentifyRequest, accuracy_told
-from pmsmtool.identification.run_files import PREDICTED
+from pmsmtool.identification.request import PREDICTED, IdentifyRequest, accuracy_told
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.identify import identify
 from pmsmtool.run_directory import RunDirectory, Stage, new_record

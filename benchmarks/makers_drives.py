@@ -35,8 +35,7 @@ from benchmarks.random_drives import draw_drive
 from pmsmtool.cli.main import cli
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file, machine_path
 from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.params.parameter_set import ParameterSet

@@ -40,7 +40,7 @@ from typing import cast
 
 import pytest
 
-from pmsmtool.packaging.kernels import KERNELS
+from pmsmtool.packaging.compiler import KERNELS
 
 ROOT = Path(__file__).parent.parent
 ROOMS = {

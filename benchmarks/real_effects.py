@@ -26,13 +26,13 @@ from benchmarks.commissioning import commanded, prepared
 from benchmarks.random_drives import draw_drive
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.files import data_folder
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.run_files import MACHINE
+from pmsmtool.identification.request import MACHINE
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.machine.torque import iron_drag
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
 
 BASES = ("interior-2k2", "fast-ipm", "random-7", "random-12")

@@ -28,10 +28,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.native import library_name
-from pmsmtool.packaging.compiler import build_compiler, compile_library
-from pmsmtool.packaging.kernels import Kernel
-from pmsmtool.sim.kernel import Application, Part, Rotor, Setup, Simulation, Target
-from pmsmtool.sim.signals import Truth
+from pmsmtool.packaging.compiler import Kernel, build_compiler, compile_library
+from pmsmtool.sim.kernel import Application, Part, Rotor, Setup, Simulation, Target, Truth
 from tests.sim.reference import SCENARIOS, Scenario, reference_run, relative_error, setup_of, simulate
 
 PERIODS = 12_000

@@ -30,9 +30,9 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import track
 from pmsmtool.estimators.tracking_model import TRACKED, Known, steady, windows
+from pmsmtool.files import data_folder
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.simulated_machine import settings_of
 from tests.tracking.simulated import true_values, warming_run
 

@@ -18,9 +18,8 @@ from pathlib import Path
 
 from benchmarks.commissioning import commanded, errors_of, prepared
 from pmsmtool.estimators.estimate import total_half_width
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.machine.profile import profile_names
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, profile_names
 
 TEMPERATURES_C = (5.0, 42.0, 60.0, 90.0)
 

@@ -43,9 +43,8 @@ from pmsmtool.machine.temperature import resistance_at
 from pmsmtool.params.catalogue import layout_signature
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.node.factory import factory_values, set_up_values
-from pmsmtool.sim.node.memory import FileStorage, Memory
+from pmsmtool.sim.node.memory import IMAGE_KEY, SIGNATURE_KEY, FileStorage, Memory, encode
 from pmsmtool.sim.node.parameter_set import ParameterImage
-from pmsmtool.sim.node.store import IMAGE_KEY, SIGNATURE_KEY, encode
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 
 BLOCKS: tuple[Block, ...] = ("ideal", "timing", "gains")

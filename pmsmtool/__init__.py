@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from pmsmtool.sim.scenarios import Scenario as Scenario
     from pmsmtool.sim.simulate import simulate as simulate
     from pmsmtool.trace import Trace as Trace
-    from pmsmtool.trace_file import read_trace as read_trace
+    from pmsmtool.trace import read_trace as read_trace
 
 __version__ = "0.1.0"
 
@@ -45,7 +45,7 @@ _HOME = {
     "PmsmtoolError": "pmsmtool.errors",
     "ExitCode": "pmsmtool.errors",
     "Trace": "pmsmtool.trace",
-    "read_trace": "pmsmtool.trace_file",
+    "read_trace": "pmsmtool.trace",
     "Estimate": "pmsmtool.machine.parameters",
     "MachineParameters": "pmsmtool.machine.parameters",
     "InverterParameters": "pmsmtool.machine.parameters",

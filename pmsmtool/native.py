@@ -46,7 +46,7 @@ def load(name: str) -> ctypes.CDLL:
     Parameters
     ----------
     name : str
-        ``pmsm_core``, ``pmsm_core_f64``, ``pmsm_sim`` or ``pmsm_design`` (``packaging/kernels.py``).
+        ``pmsm_core``, ``pmsm_core_f64``, ``pmsm_sim`` or ``pmsm_design`` (``packaging/compiler.py``).
     """
     path = LIBRARY_FOLDER / library_name(name)
     if not path.is_file():

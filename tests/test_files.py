@@ -13,8 +13,7 @@ from pmsmtool.cli.main import run
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import read_bytes, read_text, refuse_existing, write_file
 from pmsmtool.run_directory import RUN_ROOM, RunDirectory, new_record
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import write_trace
+from pmsmtool.trace import Trace, write_trace
 
 
 def test_a_file_larger_than_the_limit_is_refused(tmp_path):

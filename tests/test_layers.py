@@ -32,7 +32,6 @@ FLOORS: dict[str, int] = {
     "bus": 2,
     "units": 2,
     "native": 2,
-    "resources": 2,
     "npz_file": 2,
     "toml_file": 2,
     "run_directory": 2,
@@ -57,7 +56,7 @@ FLOORS: dict[str, int] = {
     "papers": 12,
     "cli": 13,
 }
-SAME_ROOM = {"trace_file": "trace", "__main__": "cli"}
+SAME_ROOM = {"__main__": "cli"}
 PURE = frozenset(
     {
         *("machine", "params", "estimators", "design", "firmware", "axis", "drive_maps", "identification"),
@@ -305,7 +304,7 @@ def test_no_file_is_too_long(folder: str) -> None:
         ("pmsmtool.design.x", "def f():\n    from pmsmtool.sim import plant", "pure room design imports sim"),
         ("pmsmtool.report.x", "from pmsmtool import sim", "pure room report imports sim"),
         ("pmsmtool.estimators.x", "import time", "imports time"),
-        ("pmsmtool.trace_file", "from random import random", "pure room trace imports random"),
+        ("pmsmtool.trace", "from random import random", "pure room trace imports random"),
         ("pmsmtool.machine.x", "from pmsmtool.design.tune import tune", "machine (floor 3) imports design (floor 5)"),
         ("pmsmtool.design.x", "from pmsmtool.estimators import noise", "design (floor 5) imports estimators"),
         ("pmsmtool.machine.x", "if TYPE_CHECKING:\n    from pmsmtool.firmware import image", "(floor 5)"),

@@ -28,6 +28,7 @@ from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.errors import ConfigError, PmsmtoolError, next_step
+from pmsmtool.files import data_folder
 from pmsmtool.flash.journal import Entry, Snapshot, parse_snapshot, read_snapshot
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz, load_flux_map
@@ -35,15 +36,13 @@ from pmsmtool.machine.iron_loss_map import load_iron_loss_map
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
 from pmsmtool.npz_file import read_npz
 from pmsmtool.params.parameter_set import default_set, parse_parameter_set, read_parameter_set
-from pmsmtool.proof.prediction_file import from_arrays
-from pmsmtool.resources import data_folder
+from pmsmtool.proof.judgement import from_arrays
 from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.channel import parse_channel
 from pmsmtool.sim.faults import EXAMPLE, load_faults, parse_faults
 from pmsmtool.sim.scenarios import FILE_EXAMPLE, load_scenario
 from pmsmtool.toml_file import parse_toml
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace, trace_csv, trace_npz
+from pmsmtool.trace import Trace, read_trace, trace_csv, trace_npz
 from tests.test_layers import parsed
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -191,10 +190,10 @@ def test_every_refused_file_comes_with_a_next_step(name: str, tmp_path: Path) ->
 
 
 READERS = (
-    "machine/machine_file", "machine/flux_map_import", "machine/mat_file", "trace_file",
+    "machine/machine_file", "machine/flux_map_import", "machine/mat_file", "trace",
     "sim/scenarios", "sim/faults", "sim/channel", "sim/simulated_machine", "drive_maps/dcf", "drive_maps/eds",
     "drive_maps/drive_map_file", "drive_maps/drive_map", "params/parameter_set", "design/design_file",
-    "proof/prediction_file", "machine/iron_loss_map", "design/lookup/file", "npz_file", "toml_file", "flash/journal",
+    "proof/judgement", "machine/iron_loss_map", "design/lookup/file", "npz_file", "toml_file", "flash/journal",
     "commissioning/parameter_source",
 )  # fmt: skip
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace, trace_csv, trace_npz, write_trace
+from pmsmtool.trace import Trace, read_trace, trace_csv, trace_npz, write_trace
 
 NAMES = ("i_d_a", "u_q_v", "flags")
 UNITS = {"i_d_a": "A", "u_q_v": "V", "flags": "1"}

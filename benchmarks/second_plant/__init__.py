@@ -40,8 +40,7 @@ from pmsmtool import native
 from pmsmtool.errors import ConfigError
 from pmsmtool.native import library_name
 from pmsmtool.packaging.build_kernels import PACKAGE
-from pmsmtool.packaging.compiler import build_compiler, compile_library
-from pmsmtool.packaging.kernels import HEADERS, Kernel
+from pmsmtool.packaging.compiler import HEADERS, Kernel, build_compiler, compile_library
 from pmsmtool.proof import stage
 from pmsmtool.proof.simulated import predict_proof
 from pmsmtool.sim import kernel

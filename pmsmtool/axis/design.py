@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pmsmtool.axis.loops import AxisGains, AxisPath, best_share, following_error
-from pmsmtool.axis.reference import Move, Profile, jerk_limited, plan
+from pmsmtool.axis.move import Move, Profile, jerk_limited, plan
 from pmsmtool.axis.search import Box, Case, Judged, Limits, stiffest
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, axis_loop

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array, Complex
-from pmsmtool.axis.reference import Move
+from pmsmtool.axis.move import Move
 from pmsmtool.design.loops.sampled_loop import SampledLoop
 from pmsmtool.design.loops.speed_loop import (
     Notch,

@@ -317,9 +317,6 @@ def axis_margins(plant: Lifted, path: AxisPath, gains: AxisGains, loop: Loop) ->
         delay_margin_s=float(np.min(lags / crossings)) if crossings.size else math.inf,
         modulus_margin=distance,
         crossover_rad_s=float(crossings[worst]) if worst >= 0 else math.nan,
-        phase_crossover_rad_s=float(np.append(turns, math.pi / plant.T)[factors == up.min()][0])
-        if up.size
-        else math.nan,
         bandwidth_rad_s=float(omega[below[0]]) if below.size else math.pi / plant.T,
         delay_s=path.current.delay_s + (0.5 + path.late) * path.T,
     )

@@ -20,7 +20,6 @@ from contextlib import contextmanager
 from pmsmtool.bus import sdo_block, sdo_segmented
 from pmsmtool.bus.abort_codes import TRANSPORT_CODES, AbortCode, abort_advice, abort_text
 from pmsmtool.bus.connection import Connection
-from pmsmtool.bus.given_answers import GivenAnswers, named
 from pmsmtool.bus.sdo_transfer import (
     LARGEST_UNKNOWN,
     MULTIPLEXOR,
@@ -28,10 +27,12 @@ from pmsmtool.bus.sdo_transfer import (
     SLOWEST_S_PER_BYTE,
     Attempt,
     BlockRefused,
+    GivenAnswers,
     Mode,
     Retry,
     Transfer,
     TransferLost,
+    named,
 )
 from pmsmtool.errors import BusError, DriveTimeout, PmsmtoolError, SdoAbort
 

@@ -1,14 +1,68 @@
 # SPDX-License-Identifier: MIT
-"""What an SDO transfer is made of: modes, retry policies, the result, the attempt under way."""
+"""What an SDO transfer is made of: modes, retry policies, the result, the attempt under way.
+
+A drive that refuses because it is busy is asked again, until it takes what is asked or a time is over. An answer that
+comes again and says something else is that of a second node.
+"""
 
 from __future__ import annotations
 
 import math
 import struct
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import TypeVar
 
-from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.abort_codes import BUSY_CODES, TRANSPORT_CODES, AbortCode
+from pmsmtool.bus.connection import Connection
+from pmsmtool.errors import DriveFault, SdoAbort
+
+Done = TypeVar("Done")
+BUSY_POLL_S = 0.05
+"""A busy drive is asked again so often."""
+
+
+def is_busy(fault: DriveFault) -> bool:
+    """Whether a drive refuses for now: it stores, starts, or is asked too much."""
+    return isinstance(fault, SdoAbort) and fault.code in BUSY_CODES
+
+
+def when_ready(
+    connection: Connection,
+    work: Callable[[], Done],
+    within_s: float,
+    *,
+    busy: Callable[[DriveFault], bool] = is_busy,
+    meanwhile: Callable[[], None] = lambda: None,
+) -> Done:
+    """Do something, again as long as the drive is busy; return what it gives.
+
+    Raises DriveFault: any that does not pass, or did not in the time.
+
+    Parameters
+    ----------
+    work : callable
+        May have been done in part before it is called again.
+    within_s : float
+        Time (s, bus clock) from which on the refusal is final.
+    busy : callable, optional
+        Which faults pass.
+    meanwhile : callable, optional
+        Done after every such fault.
+    """
+    clock = connection.clock
+    until = clock.now() + within_s
+    while True:
+        try:
+            return work()
+        except DriveFault as fault:
+            if not busy(fault) or clock.now() >= until:
+                raise
+        meanwhile()
+        connection.wait(BUSY_POLL_S)
+
 
 MULTIPLEXOR = struct.Struct("<BHB")
 """Command specifier, index, sub-index: the head of every initiate and abort frame."""
@@ -131,3 +185,55 @@ class TransferLost(Exception):
 
 class BlockRefused(Exception):
     """The node has no block transfer for this object. Never leaves ``bus``."""
+
+
+NAMING = (2, 3, 4)
+"""Server command specifiers of the answers that name their object: upload, download, abort."""
+REMEMBERED = 4
+"""Answers kept to compare late ones with: a second node may be slower by a few round trips."""
+LATEST_S = 2.0
+"""After a lost answer, what comes within this time may be that one."""
+
+
+class GivenAnswers:
+    """The latest answers of one node id (CiA 301, 7.2.4.3).
+
+    Attributes
+    ----------
+    contradiction : str
+        The last answer that came a second time and said something else; empty where none did.
+    """
+
+    def __init__(self) -> None:
+        self.contradiction = ""
+        self._answers: deque[bytes] = deque(maxlen=REMEMBERED)
+        self._compared_from_s = -math.inf
+
+    def keep(self, answer: bytes, now_s: float) -> None:
+        """Take an answer that was awaited."""
+        if now_s > self._compared_from_s:
+            self._answers.append(answer)
+
+    def clear(self) -> None:
+        """Forget all: somebody else of this program has asked the node, too."""
+        self._answers.clear()
+
+    def forget(self, now_s: float) -> None:
+        """After a lost answer: what still comes for a while may be late, and contradicts nothing."""
+        self._answers.clear()
+        self._compared_from_s = now_s + LATEST_S
+
+    def compare(self, frame: bytes) -> None:
+        """Note an answer to a request that was answered before, and otherwise."""
+        alike = [answer for answer in self._answers if answer[1:4] == frame[1:4]]
+        of_transport = frame[0] == 0x80 and int.from_bytes(frame[4:8], "little") in TRANSPORT_CODES
+        if frame[0] >> 5 in NAMING and alike and frame not in alike and not of_transport:
+            self.contradiction = f"{named(frame)} came twice, as {alike[-1].hex(' ')} and as {frame.hex(' ')}"
+
+
+def named(frame: bytes) -> str:
+    """Say what a frame is that was not the answer awaited."""
+    if frame[0] >> 5 not in NAMING:
+        return "a segment with the wrong toggle bit, or a late one"
+    _, index, sub = MULTIPLEXOR.unpack_from(frame)
+    return f"an answer for 0x{index:04X}:{sub:02X}"

@@ -198,7 +198,7 @@ def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDr
 def _kept_nameplate(run: RunDirectory) -> Path | None:
     """Return the machine file that the run was begun with; what the drive held at its start is no data sheet."""
     from pmsmtool.commissioning.commission import GIVEN
-    from pmsmtool.identification.run_files import NAMEPLATE
+    from pmsmtool.identification.request import NAMEPLATE
 
     path, record = run.path / NAMEPLATE, run.read()
     given = record.request.get(GIVEN, "identify" not in record.command)  # `identify` takes no machine file

@@ -38,7 +38,7 @@ def diff_command(
     from pmsmtool.commissioning.report_page import verdict
     from pmsmtool.errors import CheckFailed, ConfigError
     from pmsmtool.identification import compared_runs as compared
-    from pmsmtool.identification.run_files import read_run
+    from pmsmtool.identification.request import read_run
 
     if tol is not None and not 0.0 <= tol < 1.0:
         raise click.UsageError(f"--tol is {100.0 * tol:g} %; give it as a share or with its unit, e.g. 2%")
@@ -109,7 +109,7 @@ def _diff_of_moves(first: Path, second: Path, check: bool, out: Output) -> None:
     from pmsmtool.cli.move import TRACE
     from pmsmtool.errors import CheckFailed, ConfigError
     from pmsmtool.run_directory import RunDirectory
-    from pmsmtool.trace_file import read_trace
+    from pmsmtool.trace import read_trace
 
     traces = [read_trace(path / TRACE) for path in (first, second)]
     if not same_move(*traces):

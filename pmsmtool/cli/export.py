@@ -186,7 +186,7 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, all_la
     wanted = load_parameters(design)
     files = c_files(image_of(wanted), prefix=prefix, design_id=wanted.content_hash(), all_laws=all_laws)
     if fixed_point:
-        from pmsmtool.commissioning.export_q import q_files
+        from pmsmtool.commissioning.export import q_files
 
         files |= q_files(wanted.values, prefix=prefix, design_id=wanted.content_hash())
     make_folder(folder)

@@ -73,7 +73,7 @@ def _runs(folder: Path) -> tuple[dict[str, list[Run]], list[str]]:
     """Return the runs by their motor, in order of time, and those that hold no values."""
     from pmsmtool.errors import ConfigError, PmsmtoolError
     from pmsmtool.identification.compared_runs import measured
-    from pmsmtool.identification.run_files import read_run
+    from pmsmtool.identification.request import read_run
 
     found: dict[str, list[Run]] = {}
     left_out = []

@@ -186,7 +186,7 @@ def _scenario() -> str:
 
 
 def _environment() -> str:
-    from pmsmtool.resources import user_folder
+    from pmsmtool.files import user_folder
 
     return ENVIRONMENT.format(home=user_folder())
 

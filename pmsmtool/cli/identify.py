@@ -19,7 +19,7 @@ from pmsmtool.cli.output import Output
 if TYPE_CHECKING:
     from pmsmtool.bus.connection import Connection
     from pmsmtool.cli.fingerprint import Comparison
-    from pmsmtool.experiments.supply_levels import ReadSupply
+    from pmsmtool.experiments.standstill import ReadSupply
     from pmsmtool.identification.fingerprint import Earlier
     from pmsmtool.identification.request import IdentifyRequest, Method
     from pmsmtool.measurement.capabilities import Capabilities
@@ -134,7 +134,7 @@ def identify_command(
         if accuracy is not None:
             raise click.UsageError("--accuracy says how much is measured; with --replay it is that of the run")
         from pmsmtool.identification.replay import replay as recompute
-        from pmsmtool.identification.run_files import MACHINE, REPLAYED
+        from pmsmtool.identification.request import MACHINE, REPLAYED
         from pmsmtool.run_directory import RunDirectory
 
         run = RunDirectory(replay)

@@ -38,7 +38,7 @@ def identify_hall(bus: BusOptions, motion: MotionOptions, out: Output, runs: Pat
     from pmsmtool.experiments.rotation import WAY_RAD, turn_over_halls
     from pmsmtool.identification.hall import hall_alignment
     from pmsmtool.run_directory import Stage
-    from pmsmtool.trace_file import trace_npz
+    from pmsmtool.trace import trace_npz
     from pmsmtool.units import rad_s_from_rpm
 
     with open_drive(bus, drive_map) as drive:

@@ -73,10 +73,10 @@ def lut_command(
     from pmsmtool.design.design_file import load_machine_or_design
     from pmsmtool.design.lookup.design import LookupRequest
     from pmsmtool.design.lookup.file import table_csv, table_facts, table_npz
-    from pmsmtool.design.lookup.loci import loci
+    from pmsmtool.design.lookup.table import loci
     from pmsmtool.machine.flux_map_check import check_flux_map
     from pmsmtool.machine.iron_loss_map import load_iron_loss_map
-    from pmsmtool.machine.profile import machine_path
+    from pmsmtool.machine.machine_file import machine_path
 
     if plot_path is not None:
         figure_format(plot_path)
@@ -93,7 +93,7 @@ def lut_command(
     write_file(path.with_suffix(".csv"), table_csv(made.table))
     written = [path, path.with_suffix(".csv")]
     if plot_path is not None:
-        from pmsmtool.report.lookup_plot import lookup_figure
+        from pmsmtool.report.plots import lookup_figure
 
         save_figure(lookup_figure(made.table, lines), plot_path)
         written.append(plot_path)

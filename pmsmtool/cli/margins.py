@@ -86,7 +86,7 @@ def margins_command(
     cores of this computer or on a Dask cluster. Exit code 1 when a margin asked for fails at a corner or at the 5th
     percentile, or when more than 5 % of the simulated drives trip.
     """
-    from pmsmtool.commissioning.held_design import why_not_judged
+    from pmsmtool.commissioning.axis_design import why_not_judged
     from pmsmtool.design.design_file import load_design
     from pmsmtool.design.loops.margins import MarginRequest, margin_report
     from pmsmtool.design.tolerance import tolerance_box

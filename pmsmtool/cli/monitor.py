@@ -18,7 +18,7 @@ from pmsmtool.plain_text import counted
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pmsmtool.drive.live_readings import Column
+    from pmsmtool.drive.logged_values import Column
 
 DEFAULT_RATE_HZ = 5.0
 
@@ -61,7 +61,7 @@ def monitor_command(
     --log reads a recorded bus (candump -L, Vector ASC and others; --trace-can writes them) and needs no drive. What a
     PDO carries is read from the log, else from --eds. --map gives names and units; without it the reference objects.
     """
-    from pmsmtool.drive.live_readings import Column, available, readings, sent
+    from pmsmtool.drive.logged_values import Column, available, readings, sent
     from pmsmtool.drive.objects import signal_unit
     from pmsmtool.errors import ConfigError
 
@@ -117,8 +117,7 @@ def _show_log(
     as_csv: bool,
 ) -> None:
     from pmsmtool.bus.bus_log import BusLog
-    from pmsmtool.drive.live_readings import Column
-    from pmsmtool.drive.logged_values import logged_values, quantities
+    from pmsmtool.drive.logged_values import Column, logged_values, quantities
     from pmsmtool.drive_maps.eds import parse_eds
     from pmsmtool.errors import ConfigError
     from pmsmtool.files import read_bytes

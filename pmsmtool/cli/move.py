@@ -92,7 +92,7 @@ def move_command(
     from pmsmtool.flash.map_gate import check_motion
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.run_directory import Stage
-    from pmsmtool.trace_file import trace_npz
+    from pmsmtool.trace import trace_npz
     from pmsmtool.units import rad_s_from_rpm
 
     if not way_rad:

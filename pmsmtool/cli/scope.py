@@ -155,7 +155,7 @@ def _check(signals: tuple[str, ...], path: Path | None) -> None:
 
 def _chosen(node: DriveNode, signals: tuple[str, ...]) -> list[str]:
     """Return the names that are wanted; one that was typed and that the drive lacks is refused."""
-    from pmsmtool.drive.live_readings import available
+    from pmsmtool.drive.logged_values import available
     from pmsmtool.drive.objects import LIVE
     from pmsmtool.errors import NotAvailable
 
@@ -174,7 +174,7 @@ def _follow(
     shown: Callable[[], None] | None = None,
 ) -> None:  # fmt: skip
     """Read until the time is over, Ctrl-C or an error, at the pace of the wall clock; the page hears which it was."""
-    from pmsmtool.drive.live_readings import readings, sent
+    from pmsmtool.drive.logged_values import readings, sent
     from pmsmtool.errors import PmsmtoolError
 
     read = sent if pdo else readings
@@ -202,7 +202,7 @@ def _follow(
 
 def _write(samples: Samples, path: Path, title: str, out: Output) -> None:
     from pmsmtool.drive.objects import signal_unit
-    from pmsmtool.trace_file import write_trace
+    from pmsmtool.trace import write_trace
 
     trace = samples.trace({name: signal_unit(name) for name in samples.names}, {"source": "scope", "drive": title})
     write_trace(trace, path)

@@ -218,8 +218,7 @@ def faults_command() -> None:
 @output_options
 def list_command(out: Output) -> None:
     """List the profiles that ship with the package."""
-    from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.machine.profile import profile_names
+    from pmsmtool.machine.machine_file import load_machine_file, profile_names
     from pmsmtool.sim.channel import DEFAULT_PROFILE
 
     rows = []

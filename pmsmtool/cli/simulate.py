@@ -131,7 +131,7 @@ def _warn(trace: Trace, out: Output) -> None:
 
 def _write(trace: Trace, path: Path | None, figure_path: Path | None, out: Output) -> None:
     if path is not None:
-        from pmsmtool.trace_file import write_trace
+        from pmsmtool.trace import write_trace
 
         write_trace(trace, path)
         out.note(f"wrote {path}")

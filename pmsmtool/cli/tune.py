@@ -281,7 +281,7 @@ def _design(source: MachineFile, drive_map: DriveMap, asked: dict[str, Any]) -> 
     if drive_map.staging:
         _refuse_for_reflashed(drive_map.name, {"drive_bandwidth_hz": bandwidth_hz, **limits})
         return tune(source, TuneRequest(**asked))
-    from pmsmtool.commissioning.held_design import held_design
+    from pmsmtool.commissioning.axis_design import held_design
     from pmsmtool.design.closed_drive import ClosedDrive, tune_closed
 
     options = {name.removeprefix("limit_"): f"--{name.replace('_', '-')}" for name in _LIMITS}

@@ -22,8 +22,7 @@ from pmsmtool.commissioning.report_page import verdict
 from pmsmtool.drive.objects import LIVE, signal_unit
 from pmsmtool.drive.port import Excitation
 from pmsmtool.drive_maps.shipped_maps import family_names
-from pmsmtool.identification.request import Method
-from pmsmtool.identification.run_files import MACHINE, stored_traces
+from pmsmtool.identification.request import MACHINE, Method, stored_traces
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.capabilities import QUANTITIES, CapabilityLevel
 from pmsmtool.params.catalogue import BY_NAME

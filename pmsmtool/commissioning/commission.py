@@ -14,9 +14,9 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from pmsmtool.commissioning.closed_stage import within_ratings
 from pmsmtool.commissioning.compared_stage import check_accepted, compared, refusal
 from pmsmtool.commissioning.contradiction import DATA_SHEET
+from pmsmtool.commissioning.design_stages import within_ratings
 from pmsmtool.commissioning.level_stages import LevelStages
 from pmsmtool.commissioning.report_page import report_page
 from pmsmtool.design.lookup.design import LookupRequest
@@ -34,8 +34,7 @@ from pmsmtool.errors import (
     SafetyRefusal,
     VerifyMismatch,
 )
-from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.run_files import NAMEPLATE
+from pmsmtool.identification.request import NAMEPLATE, IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.capabilities import Capabilities, reference_capabilities
 from pmsmtool.measurement.run_account import RunAccount, begin_run, status_of, text_of
@@ -160,7 +159,7 @@ class Commissioning:
     require : tuple of str
         Stages without which the run fails; kept in its record, so that they hold when it is resumed.
     accept_limits : tuple of str
-        Limits of the design (:data:`~pmsmtool.commissioning.closed_stage.NAMES`) accepted below the machine's ratings.
+        Limits of the design (:data:`~pmsmtool.commissioning.design_stages.NAMES`) accepted below the machine's ratings.
     """
 
     run: RunDirectory

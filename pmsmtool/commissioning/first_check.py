@@ -14,7 +14,7 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.objects import LIVE, DriveObject
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, SdoAbort
-from pmsmtool.estimators.noise import estimate_noise
+from pmsmtool.estimators.current_sensors import estimate_noise
 from pmsmtool.experiments import standstill
 from pmsmtool.experiments.first_turn import HALL, SIGNALS, lead_half_a_turn
 from pmsmtool.identification.phase_check import check_phases

@@ -34,7 +34,7 @@ from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive.torque_drives import TorqueDrive, pushing_drive
 from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded, NotAvailable, SdoAbort
 from pmsmtool.experiments.first_turn import WAY_RAD, lead_half_a_turn, push_forth_and_back
-from pmsmtool.experiments.vector_turn import TURN_RAD, lead_onto_vector
+from pmsmtool.experiments.rotation import TURN_RAD, lead_onto_vector
 from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.identification.wiring import (
     COUNT_FACTORS,

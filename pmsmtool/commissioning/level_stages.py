@@ -11,8 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from pmsmtool.commissioning.closed_stage import LIMITS, closed_stage, guaranteed, why_no_limits
-from pmsmtool.commissioning.design_stages import lut_stage, margins_stage, tune_stage
+from pmsmtool.commissioning.design_stages import (
+    LIMITS,
+    closed_stage,
+    guaranteed,
+    lut_stage,
+    margins_stage,
+    tune_stage,
+    why_no_limits,
+)
 from pmsmtool.commissioning.flash_stages import flash_stage, verify_stage
 from pmsmtool.design.design_file import load_design
 from pmsmtool.design.lookup.design import LookupRequest
@@ -27,8 +34,7 @@ from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.map_gate import check_map
 from pmsmtool.identification.by_pulses import NO_POLE_PAIRS, TOO_WIDE
 from pmsmtool.identification.completed_machine import NEEDED, completed_machine
-from pmsmtool.identification.request import QUANTITIES, IdentifyRequest, Method
-from pmsmtool.identification.run_files import MACHINE, NAMEPLATE
+from pmsmtool.identification.request import MACHINE, NAMEPLATE, QUANTITIES, IdentifyRequest, Method
 from pmsmtool.identification.verdicts import blocking
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.measurement.by_injection import nameplate_of
@@ -36,7 +42,7 @@ from pmsmtool.measurement.by_pulses import OVER_TORQUE_CONSTANT, measurable
 from pmsmtool.measurement.by_vendor import vendor_line
 from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel
 from pmsmtool.measurement.identify import OF_LEVEL, SET_UP, identify, identify_after_drive
-from pmsmtool.measurement.task import Allow, Say
+from pmsmtool.measurement.limits import Allow, Say
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.proof.stage import ProofRequest, prove_stage
 from pmsmtool.report.verdict import ENCODER_SIGN

@@ -17,7 +17,7 @@ from pmsmtool.drive_maps.sheet_check import family_of_sheet, other_identity, unn
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_bytes, read_text
 from pmsmtool.machine.machine_file import SCHEMA as MACHINE_SCHEMA
-from pmsmtool.machine.profile import profile_names
+from pmsmtool.machine.machine_file import profile_names
 from pmsmtool.params import parameter_set
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
 from pmsmtool.toml_file import parse_toml

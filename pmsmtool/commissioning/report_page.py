@@ -31,8 +31,7 @@ from pmsmtool.identification.by_injection import evaluation_of
 from pmsmtool.identification.compared_runs import same_drive
 from pmsmtool.identification.evaluate import Evaluation, evaluate, shots_of
 from pmsmtool.identification.fingerprint import STAGE as FINGERPRINT
-from pmsmtool.identification.request import REQUEST, parse_request
-from pmsmtool.identification.run_files import NAMEPLATE, stored_traces
+from pmsmtool.identification.request import NAMEPLATE, REQUEST, parse_request, stored_traces
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.run_account import account_lines
 from pmsmtool.npz_file import read_npz
@@ -42,8 +41,7 @@ from pmsmtool.report import figures
 from pmsmtool.report.report import Change, Figure, Table, render
 from pmsmtool.report.verdict import COMPLETE, Verdict, is_simulated, verdict_of
 from pmsmtool.run_directory import RunDirectory, RunRecord, Stage
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace
+from pmsmtool.trace import Trace, read_trace
 
 NOT_CHECKED = (
     "Behaviour: the drive's bytes were compared, its step responses were not.",

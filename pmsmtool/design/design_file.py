@@ -16,8 +16,13 @@ from pmsmtool.design.loops.sampled_loop import LoopMargins
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
 from pmsmtool.machine.key import Key, check_table, did_you_mean
-from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_from_tables, machine_tables
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import (
+    MachineFile,
+    load_machine_file,
+    machine_from_tables,
+    machine_path,
+    machine_tables,
+)
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 from pmsmtool.plain_text import Summarised, Summary

@@ -24,9 +24,11 @@ from pmsmtool.design.loops.speed_loop import (
     SpeedPath,
     pole_placement,
     position_gain,
+    quieter,
     slowed,
     small_time_constants,
     speed_loop,
+    speed_noise,
     symmetric_optimum,
     symmetric_ratio,
 )
@@ -36,7 +38,6 @@ from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import implausible
-from pmsmtool.machine.speed_noise import quieter, speed_noise
 from pmsmtool.machine.two_masses import shafts_of, why_slower
 from pmsmtool.params.catalogue import CATALOGUE, FIELD_WEAKENING_MODES
 from pmsmtool.params.parameter_set import SATURATION

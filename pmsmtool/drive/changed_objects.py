@@ -12,15 +12,14 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from pmsmtool.bus.busy import is_busy, when_ready
 from pmsmtool.bus.sdo import Mode
+from pmsmtool.bus.sdo_transfer import is_busy, when_ready
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import ConfigError, DriveFault, SdoAbort, VerifyMismatch
-from pmsmtool.files import make_folder, read_text, write_file
-from pmsmtool.resources import user_folder
+from pmsmtool.files import make_folder, read_text, user_folder, write_file
 
 _Object = tuple[int, int]
 _MARKS: tuple[_Object, ...] = tuple(

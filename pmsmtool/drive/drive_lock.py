@@ -24,8 +24,8 @@ from pmsmtool.bus.supervision import SecondMaster
 from pmsmtool.drive.drive_node import vendor_product_serial
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.errors import ConfigError, SdoAbort
+from pmsmtool.files import user_folder
 from pmsmtool.plain_text import one_line
-from pmsmtool.resources import user_folder
 
 if sys.platform == "win32":
     import msvcrt

@@ -34,8 +34,7 @@ from pmsmtool.errors import (
     SafetyRefusal,
     StopNotConfirmed,
 )
-from pmsmtool.files import refuse_full
-from pmsmtool.resources import ELSEWHERE, USER_ROOM, user_folder
+from pmsmtool.files import ELSEWHERE, USER_ROOM, refuse_full, user_folder
 from pmsmtool.trace import Trace
 from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 

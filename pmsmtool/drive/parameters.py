@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum
 from functools import partial
 
-from pmsmtool.bus.busy import when_ready
 from pmsmtool.bus.sdo import Mode, Retry
+from pmsmtool.bus.sdo_transfer import when_ready
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import NOT_READ, DriveNode
 from pmsmtool.drive_maps.drive_map import DriveMap

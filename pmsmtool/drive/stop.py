@@ -8,8 +8,8 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
-from pmsmtool.bus.busy import when_ready
 from pmsmtool.bus.sdo import OutOfTime
+from pmsmtool.bus.sdo_transfer import when_ready
 from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.cia402 import Command, QuickStop, State, state_of
 from pmsmtool.drive import objects

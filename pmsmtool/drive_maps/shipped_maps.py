@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.errors import ConfigError
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 
 MAP_NAME = "map.toml"
 GENERIC = "cia402"

@@ -1,5 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""The voltage error of one inverter phase as data: what the drive loses between command and terminal."""
+"""The voltage error of one inverter phase as data: what the drive loses between command and terminal.
+
+What the ripple of pulse-width modulation does to an inverter's voltage error near a zero crossing.
+
+Dead time t_d acts at the two edges of each leg, and there the current differs from its sampled value. At the rising
+edge a current that leaves the leg waits for the upper switch, one that enters it swings the output by itself; at the
+falling edge it is the other way round. With e the measured curve of one leg and T_s/U_dc volts to seconds, the edges
+come late by
+
+    tau_rise = t_d - max(0, e(-i_rise)) T_s/U_dc,      tau_fall = t_d - max(0, e(i_fall)) T_s/U_dc,
+
+and the leg loses (tau_rise - tau_fall) U_dc/T_s: e(i) where both edges see i, nothing where the current passes zero
+between them. The current at an edge is the sample, in the middle of the zero vector, plus the integral of what the legs
+apply beyond their mean, over the inductances of the two axes; it moves the edges, so the two are iterated.
+
+At standstill all legs switch together, and the curve measured then is sharper than what a machine that turns sees. It
+is not quite the curve of one edge either: the edges of the two legs that carry the current lie e T_s/U_dc apart, which
+makes the current at the edge that swings by itself e T_s/(4 L) larger than the sample.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +25,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.least_squares import levenberg_marquardt
@@ -122,3 +141,141 @@ def curve_from_levels(i_vector_a: Array, u_vector_v: Array, phase_factor: float)
         if np.any(positive[group]) and not np.all(positive[group]):
             differences.append(abs(float(np.mean(odd[group][positive[group]]) - np.mean(odd[group][~positive[group]]))))
     return InverterCurve(phase_factor * np.array(x), phase_factor * np.array(y), phase_factor * max(differences))
+
+
+ROOT_3 = math.sqrt(3.0)
+LEG_ANGLES = 2.0 * math.pi / 3.0 * np.arange(3.0)
+
+ITERATIONS = 40
+STEP, SLOWING = 0.5, 4.0
+"""Part of the way to the edges' new delays in the first iteration, and the iteration at which it is half of that: with
+a sharp curve the whole way would swing between two states."""
+POINTS_BELOW = 12
+"""Points of the curve below its smallest level."""
+LEAST_CHARGE = 1e-3
+"""Least distance of the smallest level from the plateau, of the plateau: noise may make it none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Modulation:
+    """What the ripple depends on besides the voltage.
+
+    Attributes
+    ----------
+    U_dc_v : float
+        DC link (V).
+    L_h : (float, float)
+        Inductances of the machine at the switching frequency, d and q (H).
+    period_s : float
+        Switching period (s).
+    dead_time_s : float
+        From the plateau of the measured curve: V_dead T_s/U_dc (s).
+    """
+
+    U_dc_v: float
+    L_h: tuple[float, float]
+    period_s: float
+    dead_time_s: float
+
+    @property
+    def plateau_v(self) -> float:
+        """Error of a leg whose both edges see a large current (V)."""
+        return self.dead_time_s * self.U_dc_v / self.period_s
+
+
+def phases_of(d: Array, q: Array, theta_rad: Array) -> NDArray[np.float64]:
+    """Phase quantities, shape (3, n), of a vector in a frame at ``theta_rad``."""
+    angle = theta_rad - LEG_ANGLES[:, None]
+    return np.asarray(np.cos(angle) * d - np.sin(angle) * q)
+
+
+def duties(v: NDArray[np.float64], U_dc_v: float) -> NDArray[np.float64]:
+    """Duties of the legs for phase voltages, shape (3, n), both zero vectors of one length."""
+    return np.asarray(np.clip(0.5 + (v - 0.5 * (np.max(v, axis=0) + np.min(v, axis=0))) / U_dc_v, 0.0, 1.0))
+
+
+def edge_curve(curve: InverterCurve, modulation: Modulation) -> InverterCurve:
+    """Return the curve over the current at the edge, with its course below the smallest level.
+
+    A current i charges the capacitance C of a leg in C U_dc/i; where that is shorter than the dead time it takes
+    C U_dc^2/(2 i T_s) from the plateau, which the smallest level shows. Below, the error falls from half of the
+    plateau to zero.
+    """
+    plateau_v = modulation.plateau_v
+    flowing = np.minimum(curve.u_error_v, plateau_v) * modulation.period_s / (4.0 * modulation.L_h[0])
+    i, u = curve.i_phase_a + flowing, curve.u_error_v
+    if 0.5 * plateau_v < u[0]:
+        charge = max(plateau_v - float(u[0]), LEAST_CHARGE * plateau_v) * float(i[0])
+        below = np.geomspace(2.0 * charge / plateau_v, float(i[0]), POINTS_BELOW)[:-1] if plateau_v > 0.0 else i[:0]
+        i, u = np.concatenate([below, i]), np.concatenate([plateau_v - charge / below, u])
+    return InverterCurve(i, u, curve.asymmetry_v)
+
+
+def ripple_at_edges(
+    on_s: NDArray[np.float64], off_s: NDArray[np.float64], theta_rad: Array, modulation: Modulation
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Current of each leg beyond its value at the period's ends, at the leg's own rising and falling edge (A).
+
+    Parameters
+    ----------
+    on_s, off_s : ndarray, shape (3, n)
+        Times of the edges in the period (s).
+    theta_rad : ndarray, shape (n,)
+        Angle of the d axis (rad electrical).
+    modulation : Modulation
+        Link, inductances and period.
+    """
+    width = off_s - on_s
+    applied = width / modulation.period_s
+    angle = theta_rad - LEG_ANGLES[:, None]
+    c, s = np.cos(angle), np.sin(angle)
+
+    def at(time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        found = np.empty_like(time_s)
+        for x in range(3):
+            conducted = np.clip(time_s[x] - on_s, 0.0, width)
+            flux = modulation.U_dc_v * (conducted - applied * time_s[x])  # all legs alike make no vector
+            i_d, i_q = np.sum(c * flux, axis=0) / modulation.L_h[0], -np.sum(s * flux, axis=0) / modulation.L_h[1]
+            found[x] = 2.0 / 3.0 * (c[x] * i_d - s[x] * i_q)
+        return found
+
+    return at(on_s), at(off_s)
+
+
+def rippled_error_dq_v(
+    curve: InverterCurve,
+    current: tuple[Array, Array],
+    voltage: tuple[Array, Array],
+    theta_rad: Array,
+    modulation: Modulation,
+) -> tuple[Array, Array]:
+    """Error of the three phases in the rotor frame with the ripple at their edges (V).
+
+    Parameters
+    ----------
+    curve : InverterCurve
+        Error of one phase as standstill shows it.
+    current, voltage : (ndarray, ndarray)
+        d and q values (A, V), shape (n,): the current at the period's start.
+    theta_rad : ndarray, shape (n,)
+        Angle of the frame (rad electrical).
+    modulation : Modulation
+        Link, inductances, period and dead time.
+    """
+    U_dc, T_s = modulation.U_dc_v, modulation.period_s
+    v, i = phases_of(*voltage, theta_rad), phases_of(*current, theta_rad)
+    edge = (1.0 - duties(v, U_dc)) * 0.5 * T_s
+    sharp = edge_curve(curve, modulation)
+
+    def late(i_own: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(modulation.dead_time_s - np.maximum(0.0, sharp.error_v(i_own)) * T_s / U_dc)
+
+    rise, fall = late(-i), late(i)
+    for k in range(ITERATIONS):
+        step = STEP / (1.0 + k / SLOWING)
+        at_rise, at_fall = ripple_at_edges(edge + rise, T_s - edge + fall, theta_rad, modulation)
+        rise, fall = rise + step * (late(-i - at_rise) - rise), fall + step * (late(i + at_fall) - fall)
+    e_a, e_b, e_c = (rise - fall) * U_dc / T_s
+    e_alpha, e_beta = (2.0 * e_a - e_b - e_c) / 3.0, (e_b - e_c) / ROOT_3
+    c, s = np.cos(theta_rad), np.sin(theta_rad)
+    return c * e_alpha + s * e_beta, c * e_beta - s * e_alpha

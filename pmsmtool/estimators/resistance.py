@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.estimate import (
     CHI2_REFUSE,
     COVERAGE_FACTOR,
@@ -33,7 +34,6 @@ from pmsmtool.estimators.estimate import (
 )
 from pmsmtool.estimators.inverter_error import InverterCurve, curve_from_levels
 from pmsmtool.estimators.least_squares import linear_solve
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, UNKNOWN_T_RANGE_C, WINDING_TOLERANCE

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import SafetyRefusal
-from pmsmtool.experiments.shaft_answer import FIRST_S, ShaftAnswer
+from pmsmtool.experiments.mechanics_run import FIRST_S, ShaftAnswer
 from pmsmtool.experiments.speed_run import COAST_BAND, reach
 from pmsmtool.experiments.standstill import ARRIVAL_LIMIT_S
 

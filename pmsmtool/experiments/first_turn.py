@@ -7,10 +7,9 @@ import math
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError
-from pmsmtool.experiments.rotation import ROW_S
-from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
+from pmsmtool.experiments.mechanics_run import acceleration_per_ampere
+from pmsmtool.experiments.rotation import REST_LIMIT_S, ROW_S, come_to_rest, turn_vector
 from pmsmtool.experiments.signals import table
-from pmsmtool.experiments.vector_turn import REST_LIMIT_S, come_to_rest, turn_vector
 from pmsmtool.trace import Trace
 
 WAY_S = 2.5

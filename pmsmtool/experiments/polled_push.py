@@ -16,7 +16,7 @@ import numpy as np
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.flux.voltage_flux import RISING, STEADY, current_rise, voltage_drift
-from pmsmtool.experiments.shaft_answer import OVER_FRICTION, ShaftAnswer, acceleration_per_ampere, brake_shaft
+from pmsmtool.experiments.mechanics_run import OVER_FRICTION, ShaftAnswer, acceleration_per_ampere, brake_shaft
 from pmsmtool.experiments.signals import readable
 from pmsmtool.trace import Trace
 

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, auto
 
-from pmsmtool.bus.busy import is_busy, when_ready
 from pmsmtool.bus.nmt import TOOL_NODE
 from pmsmtool.bus.sdo import SdoChannel
+from pmsmtool.bus.sdo_transfer import is_busy, when_ready
 from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import STORE_TIMEOUT_S, DriveNode

@@ -14,8 +14,8 @@ from pathlib import Path
 from pmsmtool.drive.drive_node import DriveNode, is_safe, state_text
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import ConfigError, SafetyRefusal, VerifyMismatch
+from pmsmtool.files import user_folder
 from pmsmtool.flash.journal import Entry, JournalFolder, Snapshot, read_snapshot, write_snapshot
-from pmsmtool.resources import user_folder
 
 FILE = "gains.json"
 CONTENT = "gains changed for a measurement"

@@ -20,9 +20,8 @@ from typing import Any, Literal, get_args
 
 from pmsmtool.drive.port import SERIAL_BITS, Identity
 from pmsmtool.errors import ConfigError, next_step
-from pmsmtool.files import make_folder, read_bytes, read_text, write_file
+from pmsmtool.files import ELSEWHERE, make_folder, read_bytes, read_text, user_folder, write_file
 from pmsmtool.machine.key import Key, check_table
-from pmsmtool.resources import ELSEWHERE, user_folder
 
 NEXT_STEP = "give a file of `pmsmtool backup`, or a journal as it was written"
 

@@ -20,9 +20,8 @@ from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.drive_map_file import map_hash
 from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family, unnamed_drive
 from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
-from pmsmtool.files import make_folder, read_text, write_file
+from pmsmtool.files import ELSEWHERE, make_folder, read_text, write_file
 from pmsmtool.flash.journal import JournalFolder
-from pmsmtool.resources import ELSEWHERE
 
 SHOWN = 12
 """Digits of a hash that a message shows."""

@@ -15,12 +15,16 @@ from pmsmtool.identification import flux_map, frequency_response, value_verdict
 from pmsmtool.identification.cogging import save_cogging
 from pmsmtool.identification.evaluate import Evaluation, evaluate
 from pmsmtool.identification.flux_map import with_map
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, accuracy_facts, accuracy_line, dump_request
-from pmsmtool.identification.run_files import (
+from pmsmtool.identification.request import (
     MACHINE,
     NAMEPLATE,
     PREDICTED,
     REFUSED,
+    REQUEST,
+    IdentifyRequest,
+    accuracy_facts,
+    accuracy_line,
+    dump_request,
     place_of,
     refused_in,
     stored_traces,

@@ -29,8 +29,7 @@ from pmsmtool.files import read_text
 from pmsmtool.identification.calibration import calibrated_traces
 from pmsmtool.identification.completed_machine import completed_machine
 from pmsmtool.identification.evaluate import tolerance_on
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method
-from pmsmtool.identification.run_files import MACHINE, place_of
+from pmsmtool.identification.request import MACHINE, REQUEST, IdentifyRequest, Method, place_of
 from pmsmtool.identification.supply_power import resistance_by_supply
 from pmsmtool.identification.value_verdict import TOLD_BY, judged, stage_of
 from pmsmtool.identification.wiring import judge_pulses
@@ -40,8 +39,7 @@ from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K, magnet_tolerance_pe
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.report.verdict import ENCODER_SIGN as SIGN
 from pmsmtool.run_directory import RunDirectory, Stage
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace
+from pmsmtool.trace import Trace, read_trace
 from pmsmtool.units import RPM_PER_RAD_S
 
 FACTS, OLDER_FACTS = "level.json", "tier.json"

@@ -15,7 +15,7 @@ from typing import Any
 from pmsmtool.drive_maps.drive_map import Cell
 from pmsmtool.drive_maps.vendor_tuning import OS_COMMAND, VendorAnswer, VendorTuning
 from pmsmtool.identification.completed_machine import ALSO, NEEDED, CompletedMachine
-from pmsmtool.identification.run_files import MACHINE
+from pmsmtool.identification.request import MACHINE
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.machine_keys import MEASURABLE
 from pmsmtool.machine.parameters import Estimate

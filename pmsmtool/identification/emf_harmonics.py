@@ -25,8 +25,7 @@ import numpy as np
 from pmsmtool.arrays import Array, Complex
 from pmsmtool.estimators.estimate import SensorTolerance, coverage_factor
 from pmsmtool.estimators.injection.sampling_instant import Sampling
-from pmsmtool.estimators.injection.switching_ripple import Modulation, rippled_error_dq_v
-from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.inverter_error import InverterCurve, Modulation, rippled_error_dq_v
 from pmsmtool.identification.mechanics import in_frame
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.refusals import refuse

@@ -12,6 +12,14 @@ import numpy as np
 
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.estimators.cross_check import CrossCheck, cross_check
+from pmsmtool.estimators.current_sensors import (
+    Noise,
+    SensorMismatch,
+    estimate_mismatch,
+    estimate_noise,
+    widened,
+    without_mismatch,
+)
 from pmsmtool.estimators.encoder import (
     JUMP_LIMIT_RAD,
     EncoderResult,
@@ -26,8 +34,7 @@ from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.axis_response import initial_inductance
 from pmsmtool.estimators.injection.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
 from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstant
-from pmsmtool.estimators.injection.switching_ripple import Modulation
-from pmsmtool.estimators.noise import Noise, estimate_noise
+from pmsmtool.estimators.inverter_error import Modulation
 from pmsmtool.estimators.resistance import (
     R_MEASURED,
     Copper,
@@ -36,7 +43,6 @@ from pmsmtool.estimators.resistance import (
     resistance_warmed,
     settled_levels,
 )
-from pmsmtool.estimators.sensor_mismatch import SensorMismatch, estimate_mismatch, widened, without_mismatch
 from pmsmtool.estimators.shaft.frequency_response import FrequencyResponse
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.identification import frequency_response

@@ -14,8 +14,7 @@ from pmsmtool.files import read_text
 from pmsmtool.identification.by_pulses import read_facts
 from pmsmtool.identification.by_vendor import ANSWERS
 from pmsmtool.identification.compared_runs import Difference, differences, same_drive, told
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method, parse_request
-from pmsmtool.identification.run_files import MACHINE
+from pmsmtool.identification.request import MACHINE, REQUEST, IdentifyRequest, Method, parse_request
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.run_directory import Acceptance, RunDirectory, RunRecord, Stage

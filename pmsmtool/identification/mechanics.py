@@ -19,7 +19,7 @@ from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, total_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_instant_s
-from pmsmtool.estimators.injection.switching_ripple import Modulation
+from pmsmtool.estimators.inverter_error import Modulation
 from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR
 from pmsmtool.estimators.shaft.mechanics import POWERED, MechanicsResult, Torque, estimate_mechanics, mean_mechanics
 from pmsmtool.estimators.shaft.swing import swing_of
@@ -299,7 +299,7 @@ def _between_samples(
     """Return a push with the mean currents of the periods in place of the sampled ones.
 
     A dead time delays every pulse by half of it, so that the sample in the middle of the zero vector, where the current
-    falls by the mean voltage over L, is ahead by u t_d/(2 L) (``estimators/injection/switching_ripple``); a sensor's
+    falls by the mean voltage over L, is ahead by u t_d/(2 L) (``estimators/inverter_error``); a sensor's
     lag, and the instant at which it is read, displace it, too, as the inductances' fit and the flux run have found
     them.
     """

@@ -14,11 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pmsmtool.estimators.current_sensors import Noise, SensorMismatch, estimate_mismatch
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import ResistanceResult, normalised
-from pmsmtool.estimators.sensor_mismatch import SensorMismatch, estimate_mismatch
 from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 

@@ -13,8 +13,7 @@ from pmsmtool.files import read_text
 from pmsmtool.identification import by_injection, by_pulses
 from pmsmtool.identification.by_vendor import ANSWERS
 from pmsmtool.identification.calibration import calibrated_tolerance
-from pmsmtool.identification.request import REQUEST, dump_request, parse_request
-from pmsmtool.identification.run_files import MACHINE, NAMEPLATE
+from pmsmtool.identification.request import MACHINE, NAMEPLATE, REQUEST, dump_request, parse_request
 from pmsmtool.identification.value_verdict import with_left_out
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.run_directory import RunDirectory, Stage

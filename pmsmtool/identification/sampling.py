@@ -12,7 +12,7 @@ import numpy as np
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.injection.inductance import InductanceResult
 from pmsmtool.estimators.injection.sampling_instant import ShownInstant, standstill_instant_s
-from pmsmtool.estimators.injection.switching_ripple import Modulation
+from pmsmtool.estimators.inverter_error import Modulation
 from pmsmtool.estimators.resistance import Copper, ResistanceResult, normalised
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate

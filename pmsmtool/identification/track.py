@@ -21,12 +21,11 @@ from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking import Track, track
 from pmsmtool.estimators.tracking_model import INDUCTANCE_STD, TRACKED, Known
 from pmsmtool.files import read_text
-from pmsmtool.identification.run_files import stored_traces
+from pmsmtool.identification.request import stored_traces
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.temperature import loop_coefficient_per_k
 from pmsmtool.run_directory import RunDirectory, Stage
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import trace_npz
+from pmsmtool.trace import Trace, trace_npz
 
 OBSERVATIONS, KNOWN = "track", "track.json"
 KNEE_POINTS = 64

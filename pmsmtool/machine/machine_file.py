@@ -3,6 +3,7 @@
 
 ``parse_machine`` lists everything that is wrong at once; ``dump_machine_file`` writes the same file, same bytes. A
 design file embeds the same tables (``machine_tables``, ``machine_from_tables``).
+A machine is named by a file, a run directory, or a profile that ships with the package.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from pmsmtool.errors import ConfigError, next_step
-from pmsmtool.files import read_text
+from pmsmtool.files import data_folder, near_names, read_text
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_keys import MEASURABLE
@@ -27,10 +28,47 @@ from pmsmtool.machine.parameters import (
     MachineLimits,
     MachineParameters,
 )
-from pmsmtool.machine.profile import NAMED, machine_path
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS, resolved_simulation
 from pmsmtool.plain_text import Summarised, Summary
 from pmsmtool.toml_file import parse_toml, toml_lines, toml_text
+
+NAMED = "`pmsmtool sim list` names the profiles, `pmsmtool machine new` writes a file from a data sheet"
+"""Next step where a machine is not found."""
+
+
+def profile_names() -> list[str]:
+    """Return the names of the profiles that ship with the package."""
+    return sorted(path.stem for path in data_folder("profiles").glob("*.toml"))
+
+
+def machine_path(source: str | Path) -> Path:
+    """Return the machine file of a path, a run directory or a profile name; a path that ends in .toml may be missing.
+
+    Raises ConfigError: there is neither such a file nor such a profile.
+    """
+    path = Path(source)
+    if path.suffix == ".toml" or path.is_file():
+        return path
+    if (path / "machine.toml").is_file():
+        return path / "machine.toml"
+    profile = data_folder("profiles") / f"{source}.toml"
+    if profile.is_file():
+        return profile
+    if path.is_dir():
+        raise ConfigError(
+            "there is no machine.toml in this folder",
+            where=str(path),
+            hint="give the machine file itself, a run directory of identify or commission, or the name of a profile",
+        )
+    from difflib import get_close_matches
+
+    near = get_close_matches(str(source).lower(), profile_names(), 3)
+    raise ConfigError(
+        f"no profile and no file is named {str(source)!r}",
+        likely=f"did you mean {' or '.join(near)}?" if near else near_names(path),
+        hint=NAMED,
+    )
+
 
 NEXT_STEP = "`pmsmtool help machine-file` lists the keys; `pmsmtool machine new` writes a file from a data sheet"
 

@@ -14,8 +14,15 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import ConfigError
 from pmsmtool.experiments.rotation import dwell_within
 from pmsmtool.identification.by_injection import evaluated_stage
-from pmsmtool.identification.request import IdentifyRequest, steps_of
-from pmsmtool.identification.run_files import NAMEPLATE, PREDICTED, REFUSED, dump_predicted, dump_refused
+from pmsmtool.identification.request import (
+    NAMEPLATE,
+    PREDICTED,
+    REFUSED,
+    IdentifyRequest,
+    dump_predicted,
+    dump_refused,
+    steps_of,
+)
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import (
     HALLS,
@@ -25,9 +32,8 @@ from pmsmtool.machine.parameters import (
     MachineParameters,
 )
 from pmsmtool.measurement import flux_map, frequency_response, mechanics
-from pmsmtool.measurement.limits import DURATION_S, HEADROOM, Limits, require_speed, unused_current
+from pmsmtool.measurement.limits import DURATION_S, HEADROOM, Keep, Limits, Say, Task, require_speed, unused_current
 from pmsmtool.measurement.measure import Measurement, starting_gains
-from pmsmtool.measurement.task import Keep, Say, Task
 from pmsmtool.run_directory import Stage
 from pmsmtool.units import rad_s_from_rpm
 

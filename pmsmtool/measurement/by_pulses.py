@@ -27,6 +27,7 @@ from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.experiments.current_limit import LimitShown, require_limit, show_torque_limit, unproven
+from pmsmtool.experiments.mechanics_run import ShaftAnswer
 from pmsmtool.experiments.polled_push import (
     PolledPushPlan,
     PushPlan,
@@ -35,10 +36,8 @@ from pmsmtool.experiments.polled_push import (
     run_to_voltage,
     swing,
 )
-from pmsmtool.experiments.rotation import STEP_RAD, RotationPlan, dwell_within, rotate_vector
-from pmsmtool.experiments.shaft_answer import ShaftAnswer
-from pmsmtool.experiments.supply_levels import LEVELS, hold_supply_levels
-from pmsmtool.experiments.vector_turn import lead_onto_vector
+from pmsmtool.experiments.rotation import STEP_RAD, RotationPlan, dwell_within, lead_onto_vector, rotate_vector
+from pmsmtool.experiments.standstill import LEVELS, hold_supply_levels
 from pmsmtool.identification.by_pulses import (
     BY_PUSH,
     FACTS,
@@ -54,8 +53,7 @@ from pmsmtool.identification.by_pulses import (
 from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.capabilities import QUANTITIES, Capabilities
-from pmsmtool.measurement.limits import DURATION_S
-from pmsmtool.measurement.task import Keep, Say, Task
+from pmsmtool.measurement.limits import DURATION_S, Keep, Say, Task
 from pmsmtool.run_directory import Stage
 from pmsmtool.trace import Trace
 from pmsmtool.units import RAD_S_PER_RPM

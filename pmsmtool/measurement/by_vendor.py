@@ -21,7 +21,7 @@ from pmsmtool.identification.by_vendor import ANSWERS, answer_facts, evaluated_s
 from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.measurement.by_pulses import envelope_of
 from pmsmtool.measurement.capabilities import Capabilities
-from pmsmtool.measurement.task import Keep, Say, Task
+from pmsmtool.measurement.limits import Keep, Say, Task
 from pmsmtool.run_directory import Stage
 
 BY_ITSELF = "the drive chooses currents and speeds by itself: it keeps its limits 0x6073 and 0x6080, the tool watches"

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
-from pmsmtool.experiments import mechanics_run, rotation, speed_run, square_injection, standstill, vector_turn
+from pmsmtool.experiments import mechanics_run, rotation, speed_run, square_injection, standstill
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.identification.prediction import Prediction
 
@@ -80,7 +80,7 @@ class Effort:
     """
 
     levels: LevelEffort = ALL_LEVELS
-    turn_s: float = vector_turn.TURN_S
+    turn_s: float = rotation.TURN_S
     quick: bool = False
     rotations: tuple[Rotation, ...] = ()
     shot_samples: int = square_injection.SHOT_SAMPLES

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pmsmtool.drive.port import Drive
-from pmsmtool.estimators.noise import Noise
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import flux_map_scan
 from pmsmtool.machine.machine_file import MachineFile

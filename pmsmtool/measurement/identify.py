@@ -23,11 +23,10 @@ from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.torque_drives import ParameterDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
 from pmsmtool.errors import DriveFault, IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal
-from pmsmtool.experiments.supply_levels import ReadSupply
+from pmsmtool.experiments.standstill import ReadSupply
 from pmsmtool.flash.map_gate import check_motion
 from pmsmtool.identification.by_vendor import SOURCE
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method, dump_request
-from pmsmtool.identification.run_files import MACHINE
+from pmsmtool.identification.request import MACHINE, REQUEST, IdentifyRequest, Method, dump_request
 from pmsmtool.identification.value_verdict import with_left_out
 from pmsmtool.identification.verdicts import KEYS
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
@@ -36,11 +35,10 @@ from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.by_pulses import measurable
 from pmsmtool.measurement.by_vendor import vendor_quantities
 from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, reference_capabilities
+from pmsmtool.measurement.limits import Allow, Keep, Known, Say, Task
 from pmsmtool.measurement.run_account import status_of, text_of
-from pmsmtool.measurement.task import Allow, Keep, Known, Say, Task
 from pmsmtool.run_directory import RunDirectory, Stage
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import trace_npz
+from pmsmtool.trace import Trace, trace_npz
 from pmsmtool.units import format_quantity
 
 SET_UP = "the drive's own set, from its maker's set-up"

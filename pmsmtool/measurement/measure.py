@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError, PmsmtoolError
+from pmsmtool.estimators.current_sensors import Noise, estimate_noise
 from pmsmtool.estimators.encoder import (
     JUMP_LIMIT_RAD,
     EncoderResult,
@@ -25,7 +26,6 @@ from pmsmtool.estimators.encoder import (
 )
 from pmsmtool.estimators.estimate import SensorTolerance, statistical_half_width
 from pmsmtool.estimators.flux.linkage import FluxResult
-from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import rotation, speed_run, square_injection, standstill
 from pmsmtool.experiments.current_limit import (
@@ -39,16 +39,15 @@ from pmsmtool.experiments.current_limit import (
 )
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
-from pmsmtool.experiments.vector_turn import RAMP_S, come_to_rest, turn_vector
+from pmsmtool.experiments.rotation import RAMP_S, come_to_rest, turn_vector
 from pmsmtool.identification.evaluate import Evaluation, evaluate, flux_of, inductance_of, resistance_of, tolerance_on
 from pmsmtool.identification.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
-from pmsmtool.identification.request import steps_of
-from pmsmtool.identification.run_files import entry
+from pmsmtool.identification.request import entry, steps_of
 from pmsmtool.identification.value_verdict import BEND_NOTED
 from pmsmtool.identification.wiring import supply_power
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.measurement import flux_map, frequency_response, mechanics, shaft_forecast
+from pmsmtool.measurement import flux_map, frequency_response, mechanics
 from pmsmtool.measurement.effort import (
     ALL,
     QUICK_NOISE_SAMPLES,
@@ -59,7 +58,7 @@ from pmsmtool.measurement.effort import (
     larger_levels,
 )
 from pmsmtool.measurement.limits import Limits
-from pmsmtool.measurement.shaft_forecast import ShaftForecast, forecast_of
+from pmsmtool.measurement.mechanics import ShaftForecast, forecast_of
 from pmsmtool.measurement.speeds import EMF_SHARE, SpeedStage
 from pmsmtool.measurement.square_waves import BIAS_SHARE, SquareStage
 from pmsmtool.params.catalogue import BY_NAME
@@ -145,7 +144,7 @@ class Measurement:
     unproven : list of str
         What a report says of limits that could not be shown to act.
     predicted : callable or None
-        Told every prediction (``identification/run_files``) before the machine moves for it.
+        Told every prediction (``identification/request``) before the machine moves for it.
     """
 
     drive: Drive
@@ -239,7 +238,7 @@ class Measurement:
         if plan is not None and "turns" in steps:
             self._attempt("harmonics", lambda: speeds.record_harmonics(plan))
         self._tell_spent()
-        if ran and steps & set(shaft_forecast.LATER):
+        if ran and steps & set(mechanics.LATER):
             self._shaft(noise, resistance, encoder, steps)
         return ran
 
@@ -326,7 +325,7 @@ class Measurement:
 
             def planned() -> None:
                 if forecast is not None:
-                    self.say(shaft_forecast.mechanics_line(values))
+                    self.say(mechanics.mechanics_line(values))
                     self._tell(entry("mechanics", values, rough=forecast.rough))
 
             self._attempt(
@@ -345,8 +344,8 @@ class Measurement:
             def sequence(plan: FrequencyPlan) -> None:
                 if forecast is not None:
                     found = self._computed(lambda: forecast.response(plan, self.drive.period_s))
-                    self.say(shaft_forecast.response_line(found))
-                    at = {f"response_{hz:g}_hz": found.at(hz) for hz in shaft_forecast.AT_HZ}
+                    self.say(mechanics.response_line(found))
+                    at = {f"response_{hz:g}_hz": found.at(hz) for hz in mechanics.AT_HZ}
                     values = {"J_kgm2": found.J, **at}
                     self._tell(entry("frequency response", values, coherent_to_hz=found.highest_hz))
 
@@ -374,7 +373,7 @@ class Measurement:
         try:
             return forecast_of(self.drive, self._kept, noise, resistance, encoder, self._tolerance())
         except IdentificationError as error:
-            self.say(shaft_forecast.not_predicted(error))
+            self.say(mechanics.not_predicted(error))
             self._tell(entry("mechanics", {}, reason=str(error)))
             return None
 
@@ -424,12 +423,10 @@ class Measurement:
         prediction = predicted(self._effort)
         values = prediction.values(steps)
         self.say(line_of(values))
-        later = shaft_forecast.later_line(steps)
+        later = mechanics.later_line(steps)
         if later:
             self.say(later)
-        self._tell(
-            entry("levels", values, later=[what for step, what in shaft_forecast.LATER.items() if step in steps])
-        )
+        self._tell(entry("levels", values, later=[what for step, what in mechanics.LATER.items() if step in steps]))
         check_prediction(values)
 
     def _phase_check(self, noise: Noise) -> PhaseCheck:

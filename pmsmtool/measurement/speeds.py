@@ -15,7 +15,7 @@ from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import speed_run
-from pmsmtool.experiments.shaft_answer import FIRST_S, FIRST_SHARE
+from pmsmtool.experiments.mechanics_run import FIRST_S, FIRST_SHARE
 from pmsmtool.experiments.speed_run import SpeedPlan
 from pmsmtool.identification.emf_harmonics import TRACE as EMF_TRACE
 from pmsmtool.machine.torque import torque_per_ampere

@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from pmsmtool.drive.port import Drive
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.injection.angle_dependence import unseen_std
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES
 from pmsmtool.estimators.injection.inductance import MINIMUM_PERIODS, ROTOR_LIMIT_RAD, rotor_way
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import square_injection
-from pmsmtool.experiments.vector_turn import turn_vector
+from pmsmtool.experiments.rotation import turn_vector
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace

@@ -17,14 +17,20 @@ from pathlib import Path
 
 from pmsmtool.native import LIBRARY_FOLDER, PAGE_MODULE, library_name
 from pmsmtool.packaging.compiler import (
+    COMPILE_FLAGS,
+    INCLUDE_FOLDERS,
+    KERNELS,
+    SIMULATION,
     Compiler,
     CompilerError,
+    Kernel,
+    Target,
     build_compiler,
     compile_library,
+    is_current,
     run_compiler,
     zig_compiler,
 )
-from pmsmtool.packaging.kernels import COMPILE_FLAGS, INCLUDE_FOLDERS, KERNELS, SIMULATION, Kernel, Target, is_current
 
 PACKAGE = Path(__file__).resolve().parent.parent
 

@@ -27,7 +27,7 @@ from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, T
 from pmsmtool.papers.registry import OURS
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.drive_kernel import KernelCore
-from pmsmtool.sim.kernel import Target
+from pmsmtool.sim.kernel import Signal, Target, Truth
 from pmsmtool.sim.line import Line
 from pmsmtool.sim.node.drive_core import Command, ControlMode
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH, drive_settings
@@ -35,7 +35,6 @@ from pmsmtool.sim.node.family import Face
 from pmsmtool.sim.node.memory import Memory, RamStorage
 from pmsmtool.sim.node.node import Node
 from pmsmtool.sim.node.session import Session
-from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import with_simulation
 from pmsmtool.units import RPM_PER_RAD_S
 

@@ -22,9 +22,8 @@ from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.sim.kernel import Application, Part, Rotor, Setup, Simulation, Target
+from pmsmtool.sim.kernel import Application, Part, Rotor, Setup, Signal, Simulation, Target, Truth
 from pmsmtool.sim.scenarios import MODES
-from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import build_setup, with_simulation
 from pmsmtool.units import RAD_S_PER_RPM
 

@@ -11,7 +11,6 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, at_most, near
-from pmsmtool.papers.polar_measures import peak_current_apk, settling_ms
 from pmsmtool.papers.polar_scene import (
     ASSUMED,
     BASELINES,
@@ -37,6 +36,7 @@ from pmsmtool.papers.polar_scene import (
     run,
     steps,
 )
+from pmsmtool.papers.statistics import peak_current_apk, settling_ms
 
 SIX_STEP = 2.0 * math.sqrt(3.0) / math.pi
 """Fundamental of six-step operation over the largest of the linear range: (2/pi) / (1/sqrt(3)) = 1.1027."""

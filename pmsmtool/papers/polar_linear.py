@@ -19,14 +19,12 @@ from pmsmtool.papers.figure import (
     at_most,
     near,
 )
-from pmsmtool.papers.polar_measures import Staircase, phase_step_rms, staircase
 from pmsmtool.papers.polar_scene import (
     ASSUMED,
     BASELINES,
     EXPECTED,
     EXPERIMENT,
     FOC_CDM,
-    K_T,
     LINEAR,
     PRINTED,
     QUIET_NOISY,
@@ -41,11 +39,10 @@ from pmsmtool.papers.polar_scene import (
     steps,
 )
 from pmsmtool.papers.polar_steps import panels
+from pmsmtool.papers.statistics import Staircase, phase_step_rms, staircase
 
 LEAD_S, EACH_S = 0.02, 0.02
 LOW_RPM, HIGH_RPM = 0.0, 400.0
-STEP_A = 1.0 / K_T
-"""i_q of 1 N m (A)."""
 
 STAIRS = (0.0, 1.0, 0.0, -1.0, 0.0)
 REVERSAL = (0.0, 1.0, -1.0, 1.0)

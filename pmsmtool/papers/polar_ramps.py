@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, at_most
-from pmsmtool.papers.polar_measures import torque_bump
 from pmsmtool.papers.polar_scene import (
     ASSUMED,
     BASELINES,
@@ -28,6 +27,7 @@ from pmsmtool.papers.polar_scene import (
     Response,
     run,
 )
+from pmsmtool.papers.statistics import torque_bump
 from pmsmtool.sim.scenarios import Profile as Nodes
 
 BUMP_NM = 0.025

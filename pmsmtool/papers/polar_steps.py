@@ -18,7 +18,6 @@ from pmsmtool.papers.figure import (
     at_most,
     near,
 )
-from pmsmtool.papers.polar_measures import TorqueStep, torque_step
 from pmsmtool.papers.polar_scene import (
     ASSUMED,
     BASELINES,
@@ -48,6 +47,7 @@ from pmsmtool.papers.polar_scene import (
     run,
     steps,
 )
+from pmsmtool.papers.statistics import TorqueStep, torque_step
 
 LEAD_S = 0.06
 """Run before the figure starts, from zero current: the controller reaches its own steady state."""

@@ -12,7 +12,6 @@ import numpy as np
 from pmsmtool.machine.key import Value
 from pmsmtool.papers.figure import Column, Panel, Reproduction, Series, Table, at_most
 from pmsmtool.papers.polar_linear import DELAYED
-from pmsmtool.papers.polar_measures import peak_current_apk
 from pmsmtool.papers.polar_scene import (
     ASSUMED,
     BASELINES,
@@ -30,6 +29,7 @@ from pmsmtool.papers.polar_scene import (
     run,
     steps,
 )
+from pmsmtool.papers.statistics import peak_current_apk
 from pmsmtool.units import rad_s_from_rpm
 
 SPEEDS_RPM = (0.0, 200.0, 600.0, 900.0, 1200.0, -1400.0)

@@ -51,7 +51,6 @@ RAMP_NOISE_A = 1.0
 """Added to the peak of the ramp with noisy samples; measured 47.19 to 47.47 A, seeds 1 to 4."""
 SHOWN_S = 0.1
 
-Nodes = Sequence[tuple[float, float]]
 BEST_LAWS = tuple(
     replace(BEST, name=f"best, row {row:g} A, eps {eps:g}", eps=eps, I_transient_apk=row)
     for row in (I_MAX_A, WIDE_A)

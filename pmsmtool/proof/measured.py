@@ -15,7 +15,8 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.drive.port import Drive, Injection
 from pmsmtool.errors import CheckFailed
 from pmsmtool.experiments.speed_run import reach
-from pmsmtool.proof.plan import Conditions, Experiment, ProofPlan, room_k, warmth
+from pmsmtool.proof.conditions import Conditions, room_k, warmth
+from pmsmtool.proof.plan import Experiment, ProofPlan
 from pmsmtool.trace import Trace
 from pmsmtool.units import RAD_S_PER_RPM
 

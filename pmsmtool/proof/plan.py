@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,6 @@ from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.identification.frequency_response import NOTHING, RIGID, SHOWN
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, MEAN_FALLBACK, PLAY_FALLBACK
 from pmsmtool.machine.hall import HallCommutation
-from pmsmtool.machine.temperature import WARMING
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.machine.two_masses import (
     CERTAIN_ZETA,
@@ -29,6 +27,7 @@ from pmsmtool.machine.two_masses import (
 )
 from pmsmtool.machine.uncontrolled_generation import STATED
 from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES
+from pmsmtool.proof.conditions import Conditions, room_k, warmth
 from pmsmtool.units import RAD_S_PER_RPM
 
 SIGNALS = ("i_d_a", "i_q_a", "omega_e_rad_s", "u_d_lim_v", "u_q_lim_v")
@@ -65,9 +64,6 @@ SPEED_SHARE = 0.92
 """Largest speed that is asked for, of the envelope's."""
 CURRENT_SHARE = 0.9
 """Largest current that is asked for, of the envelope's."""
-WARMEST_SHARE = 0.8
-"""Largest rise of the winding in a change of the speed, of what is left below its trip: friction and the loop's
-overshoot take current, too. Of a winding that warms with 4.4 s, a step from 105 degC tripped a healthy drive at 155."""
 COOL_LEAST = 0.2
 """Least speed step that such a winding is asked for, of the one that the loops and the record have room for."""
 SPEED_ROWS = 400
@@ -113,43 +109,6 @@ MOST_COUNTS = 4e9
 """Increments/s3 and /s2: what 0x60A4, 0x6083 and 0x6084 (UNSIGNED32) hold."""
 MOST_WAY = 2**30
 """Increments of a move: half of what tells forth from back in 0x607A (INTEGER32)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Conditions:
-    """What the drive reports before anything moves, and what it may do.
-
-    Attributes
-    ----------
-    U_dc_v : float
-        DC link as measured (V).
-    T_winding_c, T_magnet_c : float
-        As measured; NaN without a sensor.
-    encoder_counts : int
-        Counts per turn, 0 when the drive does not tell.
-    i_max_apk, speed_max_rad_s : float
-        The envelope.
-    shaft : str
-        ``free``, ``locked`` or ``coupled``.
-    U_dc_ripple_v : float
-        Amplitude of the link's ripple (V).
-    offsets_apk : (float, float, float)
-        Currents that the sensors of a, b, c show without current (A), less their mean.
-    """
-
-    U_dc_v: float
-    T_winding_c: float
-    T_magnet_c: float
-    encoder_counts: int
-    i_max_apk: float
-    speed_max_rad_s: float
-    shaft: str = "free"
-    U_dc_ripple_v: float = 0.0
-    offsets_apk: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def facts(self) -> dict[str, Any]:
-        """Return them as JSON; what is not known is None."""
-        return {key: None if isinstance(v, float) and math.isnan(v) else v for key, v in asdict(self).items()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -341,22 +300,6 @@ class _Sizes:
     def rise(self, i_q_a: float) -> float:
         """Rise of the electrical speed per control period at i_d = 0 (rad/s); none where the inertia is not known."""
         return torque_per_ampere(self.p**2, self.psi) * i_q_a / self.J * self.T_s if self.J > 0.0 else 0.0
-
-
-def warmth(design: Design) -> float:
-    """Return what the winding rises by in a change of the speed, times its time over its square (K s/(rad/s)2).
-
-    Mechanical; 0 where no sensor told how it warms, or the shaft is not known.
-    """
-    machine, rate = design.machine.machine, design.machine.conditions.get(WARMING, 0.0)
-    per_ampere = torque_per_ampere(machine.pole_pairs, machine.psi_f_wb)
-    return rate * ((machine.J_kgm2 or 0.0) / per_ampere) ** 2 if isinstance(rate, float) and per_ampere > 0.0 else 0.0
-
-
-def room_k(design: Design, T_winding_c: float) -> float:
-    """Return by how much a change of the speed may warm the winding (K); any where no sensor tells."""
-    left = WARMEST_SHARE * (design["protection.T_winding_max_c"] - T_winding_c)
-    return math.inf if math.isnan(left) else max(0.0, left)
 
 
 def _generation_rpm(design: Design) -> float:

@@ -17,10 +17,9 @@ from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.errors import NotAvailable
 from pmsmtool.proof.simulated_margins import variations
 from pmsmtool.sim.closed_loop import drive_values, image_of, open_simulation
-from pmsmtool.sim.kernel import STRUCTS, Params, Part, Setup
+from pmsmtool.sim.kernel import STRUCTS, Params, Part, Setup, Signal, Truth
 from pmsmtool.sim.monte_carlo import vary
 from pmsmtool.sim.scenarios import MODES, SCHEDULES, Scenario, built_in
-from pmsmtool.sim.signals import Signal, Truth
 
 DRAWN = 32
 """Machines drawn from the tolerance box: the page runs them within 0.1 s, and their range holds 91 % of all."""

@@ -28,15 +28,15 @@ from pmsmtool.machine.flux_map import FluxScale, ScalableMap
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.proof.conditions import Conditions
 from pmsmtool.proof.defects import DEFECTS, QUANTITIES, Defect, is_possible
 from pmsmtool.proof.drawn_machine import EMF_HARMONICS, T_MAGNET_SPREAD_K, T_SPREAD_K, U_DC_SPREAD, about, draw_machine
-from pmsmtool.proof.plan import Conditions, Experiment, ProofPlan
+from pmsmtool.proof.plan import Experiment, ProofPlan
 from pmsmtool.proof.simulated_move import hold, record_move
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
-from pmsmtool.sim.kernel import Params, Part, Setup, Simulation
+from pmsmtool.sim.kernel import Params, Part, Setup, Simulation, Truth
 from pmsmtool.sim.monte_carlo import cores
 from pmsmtool.sim.scenarios import MODES
-from pmsmtool.sim.signals import Truth
 from pmsmtool.sim.simulated_machine import build_setup
 from pmsmtool.units import rpm_from_rad_s
 

@@ -7,9 +7,8 @@ import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.proof.plan import Experiment
-from pmsmtool.sim.kernel import Part, Simulation
+from pmsmtool.sim.kernel import Part, Signal, Simulation
 from pmsmtool.sim.node.drive_core import ControlMode, RecorderState, Trigger
-from pmsmtool.sim.signals import Signal
 
 _SIGNALS = {
     "following_error_rad": Signal.FOLLOWING_ERROR, "omega_e_rad_s": Signal.OMEGA_E, "i_q_a": Signal.I_Q,

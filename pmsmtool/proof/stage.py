@@ -7,10 +7,7 @@ in ``prove/<first digits of the hash>/`` of the run, so a proof that is repeated
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import math
-import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain, count
@@ -22,7 +19,6 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.prediction import Prediction
-from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
@@ -42,26 +38,20 @@ from pmsmtool.identification.wiring import SUPPLY
 from pmsmtool.machine.parameters import Brake, Load, Shaft
 from pmsmtool.measurement.limits import within_supply
 from pmsmtool.npz_file import npz_bytes, read_npz
+from pmsmtool.proof.conditions import Conditions, conditions_of
 from pmsmtool.proof.drawn_machine import BENT, SEEN_SHARES, U_DC_SPREAD, bend_of
-from pmsmtool.proof.judgement import Judgement, judge, with_ripple
+from pmsmtool.proof.judgement import Judgement, from_arrays, judge, to_arrays, with_ripple
 from pmsmtool.proof.measured import SpeedNotReached, run_experiments
-from pmsmtool.proof.plan import LINK, Conditions, Experiment, ProofPlan, plan_proof
-from pmsmtool.proof.prediction_file import from_arrays, to_arrays
+from pmsmtool.proof.plan import LINK, Experiment, ProofPlan, plan_proof
 from pmsmtool.proof.simulated import RUNS, averaged, predict_proof
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace, trace_npz
+from pmsmtool.trace import Trace, read_trace, trace_npz
 from pmsmtool.units import RAD_S_PER_RPM
 
 FOLDER = "prove"
 PREDICTION = "prediction.npz"
 GROSS = 3.0
 """A response this far outside its band, in half widths, ends the proof: what is demanded next needs what has failed."""
-LINK_READINGS = 200
-"""Readings of the DC link whose mean counts, 0.1 s and more of a rectifier's ripple: with one reading of 2.2 % of it, a
-healthy drive entered field weakening 1.23 half widths of the band late (the mean: within 0.2 %)."""
-OFFSET_READINGS = 32
-"""Readings of each phase's current before the bridge is on: their mean is the offset that the sensor has now."""
 LOWEST_LINK = 0.05
 """Quantile of a record that is the link under load: its noise is not."""
 LINK_KEPT = 0.87
@@ -268,28 +258,6 @@ def refuse_other_set(node: DriveNode, design: Design) -> None:
             likely="another design was flashed, or none",
             hint="`pmsmtool flash-params DESIGN` first; nothing was moved",
         )
-
-
-def conditions_of(drive: CanopenDrive, envelope: Envelope) -> Conditions:
-    """Read what the prediction depends on, with the drive off."""
-    counts = 0
-    with contextlib.suppress(SdoAbort):
-        counts = drive.node.whole(objects.ENCODER_INCREMENTS)
-
-    def live(name: str) -> float:
-        try:
-            return drive.live(name)
-        except SdoAbort:
-            return math.nan
-
-    link = [drive.live("U_dc_v") for _ in range(LINK_READINGS)]
-    shown = [statistics.fmean(live(f"i_{phase}_a") for _ in range(OFFSET_READINGS)) for phase in "abc"]
-    offsets = [offset - statistics.fmean(shown) if math.isfinite(sum(shown)) else 0.0 for offset in shown]
-    return Conditions(
-        statistics.fmean(link), live("T_winding_c"), live("T_magnet_c"), counts,
-        envelope.i_max_apk, envelope.speed_max_rad_s, envelope.shaft, math.sqrt(2.0) * statistics.pstdev(link),
-        (offsets[0], offsets[1], offsets[2]),
-    )  # fmt: skip
 
 
 def commit(run: RunDirectory, prediction: Prediction) -> tuple[str, str]:

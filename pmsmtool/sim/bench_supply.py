@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from pmsmtool.sim.drive_kernel import KernelCore
-from pmsmtool.sim.signals import Truth
+from pmsmtool.sim.kernel import Truth
 
 IDLE_W = 4.0
 """Power of the drive without a motor current."""

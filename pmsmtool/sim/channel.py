@@ -40,11 +40,11 @@ from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import machine_path
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
 from pmsmtool.sim.faults import load_faults
 from pmsmtool.sim.line import Line
-from pmsmtool.sim.node.face import DriveFace
+from pmsmtool.sim.node.dictionary import DriveFace
 from pmsmtool.sim.node.factory import drive_settings
 from pmsmtool.sim.node.family import LEVEL_HIDES, Face, Reduced
 from pmsmtool.sim.node.lss import UNCONFIGURED

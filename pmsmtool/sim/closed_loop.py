@@ -13,9 +13,8 @@ from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
-from pmsmtool.sim.kernel import Application, Part, Rotor, Simulation
+from pmsmtool.sim.kernel import Application, Part, Rotor, Signal, Simulation, Truth
 from pmsmtool.sim.scenarios import MODES, SCHEDULES, Scenario
-from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import (
     RECORD_COMPENSATION,
     ROTORS,

@@ -16,7 +16,7 @@ from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import default_set
 from pmsmtool.sim.closed_loop import image_of
-from pmsmtool.sim.kernel import Part, Simulation
+from pmsmtool.sim.kernel import Part, Signal, Simulation
 from pmsmtool.sim.node.drive_core import (
     BUFFER_SAMPLES,
     TRACE_BYTES,
@@ -34,7 +34,6 @@ from pmsmtool.sim.node.drive_core import (
     RecorderState,
     RecorderStatus,
 )
-from pmsmtool.sim.signals import Signal
 from pmsmtool.sim.simulated_machine import (
     RECORD_COMPENSATION,
     build_setup,

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""The simulation kernel ``pmsm_sim`` through ctypes: its structs, declared functions, owned memory.
+"""The simulation kernel ``pmsm_sim`` through ctypes: its structs, signals, functions, owned memory.
 
 The structs are read from ``closed_loop.h``, ``plant.h``, ``inverter.h``, ``sensors.h``, ``monte_carlo.h`` and
-``pmsm_application.h``, where their members are explained; their sizes are checked when the library is loaded.
+``pmsm_application.h``, where their members are explained; their sizes are checked when the library is loaded. The
+numbers of the signals are those of ``pmsm_application.h`` and ``closed_loop.h``.
 """
 
 from __future__ import annotations
@@ -21,6 +22,74 @@ from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.core_binding import APPLICATION_HEADER, CORE_HEADERS, HEADER_FOLDER
 from pmsmtool.machine.flux_map_cells import FluxMapStruct
+
+
+class Signal(IntEnum):
+    """A quantity that can be read, recorded, averaged or triggered on (``enum pmsm_signal``)."""
+
+    NONE = 0
+    I_D = 1
+    I_Q = 2
+    I_D_REQ = 3
+    I_Q_REQ = 4
+    I_D_REF = 5
+    I_Q_REF = 6
+    U_D = 7
+    U_Q = 8
+    U_D_LIM = 9
+    U_Q_LIM = 10
+    THETA_E = 11
+    OMEGA_E = 12
+    TAU = 13
+    KAPPA = 14
+    BINDING = 15
+    ITERATIONS = 16
+    FLAGS = 17
+    I_A = 18
+    I_B = 19
+    I_C = 20
+    U_DC = 21
+    T_WINDING = 22
+    T_MAGNET = 23
+    THETA_M = 24
+    FOLLOWING_ERROR = 25
+    HALL = 26
+
+
+class Truth(IntEnum):
+    """Signals of the plant (``enum pmsm_truth``), numbered on beside those of the drive (:class:`Signal`)."""
+
+    T = 64
+    I_D = 65
+    I_Q = 66
+    I_A = 67
+    I_B = 68
+    I_C = 69
+    PSI_D = 70
+    PSI_Q = 71
+    PSI_ALPHA = 72
+    PSI_BETA = 73
+    THETA_E = 74
+    THETA_M = 75
+    OMEGA_M = 76
+    TORQUE = 77
+    LOAD = 78
+    U_DC = 79
+    T_WINDING = 80
+    T_MAGNET = 81
+    DUTY_A = 82
+    DUTY_B = 83
+    DUTY_C = 84
+    GATES = 85
+    U_ALPHA = 86
+    U_BETA = 87
+    OMEGA_LOAD = 88
+    TWIST = 89
+    R = 90
+    U_ALPHA_MEAN = 91
+    U_BETA_MEAN = 92
+    TRIP = 93
+
 
 _f32, _f64, _u32, _u64 = ctypes.c_float, ctypes.c_double, ctypes.c_uint32, ctypes.c_uint64
 

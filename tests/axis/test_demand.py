@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from pmsmtool.axis.reference import Move, Profile, plan, trapezoid_of
+from pmsmtool.axis.move import Move, Profile, plan, trapezoid_of
 
 SPEED_WITHIN, RAMP_WITHIN = 0.015, 0.02
 """Relative; measured 1.0 % both."""

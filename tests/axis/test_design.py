@@ -40,7 +40,6 @@ from pmsmtool.design.loops.speed_loop import Notch
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.envelope import largest_torque
-from pmsmtool.drive_maps.measured_rows import MeasuredRow, with_measured
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.flash.journal import Entry
@@ -48,6 +47,7 @@ from pmsmtool.flash.plan import make_plan, names_to_read
 from pmsmtool.flash.restore import snapshot_set
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.two_masses import mechanics_of
+from pmsmtool.measurement.learned_rows import MeasuredRow, with_measured
 from pmsmtool.params.catalogue import INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
 from pmsmtool.params.parameter_set import ParameterSet
 

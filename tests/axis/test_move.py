@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pmsmtool.axis.move import compared_moves, move_result, same_move, shown
-from pmsmtool.axis.reference import Profile, plan
+from pmsmtool.axis.move import Profile, compared_moves, move_result, plan, same_move, shown
 from pmsmtool.errors import IdentificationError
 from pmsmtool.identification.move_mechanics import halves_of_moves
 from pmsmtool.trace import Trace

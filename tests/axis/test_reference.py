@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from pmsmtool.axis.reference import Profile, jerk_limited, plan
+from pmsmtool.axis.move import Profile, jerk_limited, plan
 from pmsmtool.errors import ConfigError
 
 LIMITS = Profile(20.0, 400.0, 20_000.0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.axis.loops import AxisGains, AxisPath, Structure, best_share, following_error, lifted
-from pmsmtool.axis.reference import Profile, plan
+from pmsmtool.axis.move import Profile, plan
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
 from pmsmtool.machine.two_masses import Mechanics
 

@@ -10,8 +10,8 @@ import pytest
 
 from pmsmtool.bus.connect import Connection
 from pmsmtool.bus.examination import examine
-from pmsmtool.bus.given_answers import LATEST_S
 from pmsmtool.bus.sdo import SdoChannel
+from pmsmtool.bus.sdo_transfer import LATEST_S
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.errors import BusError, DriveTimeout
 from tests.bus.scripted import NODE, ScriptedBus, ScriptedSlave

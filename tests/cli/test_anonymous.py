@@ -18,12 +18,10 @@ import pytest
 
 from pmsmtool.cli.main import run as program
 from pmsmtool.commissioning.anonymous import DIGITS, anonymous_run, anonymous_text
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.run_directory import Acceptance, RunDirectory, RunRecord, Stage, new_record
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import trace_npz
+from pmsmtool.trace import Trace, trace_npz
 
 SERIAL = 0x5EC2E7A1
 BEGAN_S = 1_795_446_123.25

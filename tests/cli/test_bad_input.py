@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from pmsmtool.cli import main
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.resources import data_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 

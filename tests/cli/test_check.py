@@ -10,8 +10,7 @@ import pytest
 
 from pmsmtool.commissioning.first_check import fault_row
 from pmsmtool.identification.wiring import WRONG, judge_supply
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.refusals import refuse
 from tests.cli.conftest import Tool
 

@@ -20,8 +20,7 @@ from pmsmtool.errors import LimitExceeded
 from pmsmtool.experiments.first_turn import WAY_RAD, push_forth_and_back
 from pmsmtool.identification.by_pulses import NO_LINK, no_link
 from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG, judge_current, judge_pulses, judge_push
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.line import Frame
 from pmsmtool.trace import Trace

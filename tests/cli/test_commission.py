@@ -30,12 +30,11 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map
+from pmsmtool.files import data_folder
 from pmsmtool.flash.restore import take_backup
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request
-from pmsmtool.identification.run_files import NAMEPLATE
+from pmsmtool.identification.request import NAMEPLATE, REQUEST, IdentifyRequest, dump_request
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.report.verdict import NEEDED
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, RunRecord, Stage, Status, new_record
 from pmsmtool.sim.bus import PmsmSimBus
 from tests.cli.conftest import Tool

@@ -15,9 +15,8 @@ from click.testing import CliRunner
 from pmsmtool.cli.main import cli
 from pmsmtool.errors import CheckFailed, ConfigError
 from pmsmtool.identification.compared_runs import LEAST_SERIES, differences, drift, same_drive, series
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.run_directory import RunDirectory, RunRecord, Stage
 

@@ -99,13 +99,13 @@ def test_prompt_on_a_real_terminal(key: bytes, code: int) -> None:
 
     program = """
 import sys
-from pmsmtool.cli import consent, failure
+from pmsmtool.cli import consent, main
 from pmsmtool.cli.options import MotionOptions
 from pmsmtool.cli.output import Output
 try:
     consent.ask_writing(["R_s 1 2"], MotionOptions(), simulated=False, serial=1, out=Output())
 except BaseException as error:
-    sys.exit(failure.report(error))
+    sys.exit(main.report(error))
 """
     child, terminal = pty.fork()
     if child == 0:

@@ -14,8 +14,7 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.machine.key import Value
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.sim.simulated_machine import settings_of
 from tests.cli.conftest import Tool
 

@@ -25,11 +25,11 @@ from pmsmtool.design.tune import tune
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap, reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import data_folder
 from pmsmtool.firmware.export_c import FLAGS
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
 from pmsmtool.params.parameter_set import ParameterSet
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, new_record
 from tests.concise_dcf import read_concise
 from tests.firmware.exported_image import image_of_json

@@ -19,9 +19,8 @@ from pmsmtool.identification.by_vendor import ANSWERS
 from pmsmtool.identification.fingerprint import QUANTITIES, fingerprint_stage, read_earlier
 from pmsmtool.identification.request import REQUEST, IdentifyRequest, Method, dump_request
 from pmsmtool.identification.value_verdict import value_facts
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.measurement.by_injection import with_limits_of
 from pmsmtool.run_directory import RunDirectory, RunRecord, Stage
 from tests.cli.conftest import Tool

@@ -16,8 +16,8 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.bus import PmsmSimBus
 from tests.cli.conftest import Tool

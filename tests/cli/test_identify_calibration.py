@@ -15,10 +15,10 @@ from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.cli.main import run
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.files import data_folder
 from pmsmtool.identification.calibration import calibrated_tolerance
 from pmsmtool.identification.evaluate import tolerance_on
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.resources import data_folder
 from tests.simulated_bus import settle
 
 GAIN = 1.01

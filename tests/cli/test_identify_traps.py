@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.cli.main import run
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace, trace_npz
+from pmsmtool.trace import Trace, read_trace, trace_npz
 from tests.simulated_bus import settle
 
 pytestmark = pytest.mark.chain

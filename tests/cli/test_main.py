@@ -16,7 +16,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from pmsmtool.cli import command_table, failure, main, options
+from pmsmtool.cli import command_table, main, options
 from pmsmtool.cli.help_topics import EXIT_CODES, TOPICS
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import (
@@ -132,7 +132,6 @@ def test_modules_of_commands_are_all_registered() -> None:
         "__init__",
         "command_table",
         "consent",
-        "failure",
         "main",
         "options",
         "output",
@@ -299,7 +298,7 @@ def test_message_says_what_where_likely_and_try(capsys: pytest.CaptureFixture[st
     error = ConfigError(
         "two keys are wrong", where="m.toml", likely="old file", hint="see help files", violations=["a: 1", "b: 2"]
     )
-    assert failure.report(error) == 2
+    assert main.report(error) == 2
     lines = capsys.readouterr().err.splitlines()
     assert lines[:3] == ["error: two keys are wrong", "  - a: 1", "  - b: 2"]
     assert lines[3:] == ["  where:  m.toml", "  likely: old file", "  try:    see help files"]
@@ -362,13 +361,13 @@ def test_reader_gone_and_full_disk(unbuffered: str, monkeypatch: pytest.MonkeyPa
 def test_signals_leave_through_finally(number: signal.Signals) -> None:
     program = """
 import sys, time
-from pmsmtool.cli import failure, main
+from pmsmtool.cli import main
 def wait(arguments):
     try:
         print("ready", flush=True)
         time.sleep(30)
     except KeyboardInterrupt as error:
-        return failure.report(error)
+        return main.report(error)
     finally:
         print("stopped", flush=True)
 main.run = wait

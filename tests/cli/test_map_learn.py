@@ -18,14 +18,13 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import GuardedDrive, guarded
 from pmsmtool.drive.speed_loop_drive import Oscillation, SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
-from pmsmtool.drive_maps.measured_rows import MeasuredRow, with_measured
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveFault, LimitExceeded, SafetyRefusal
 from pmsmtool.flash.gain_journal import any_left
 from pmsmtool.identification.speed_loop_response import SpeedLoop
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.measurement import changed_gains, learn_gains, learn_position_gain
+from pmsmtool.measurement.learned_rows import MeasuredRow, with_measured
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.node.node import Node

@@ -14,11 +14,9 @@ import pytest
 
 from pmsmtool.arrays import Array
 from pmsmtool.axis.design import PID
-from pmsmtool.axis.reference import mirrored, trapezoid_of
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.machine.profile import machine_path
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace
+from pmsmtool.axis.move import mirrored, trapezoid_of
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
+from pmsmtool.trace import Trace, read_trace
 from pmsmtool.units import rad_s_from_rpm
 from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import COMMON, HEARTBEAT, Row, epos4, faulhaber, identity, unknown, write_eds

@@ -10,7 +10,7 @@ import pytest
 import pmsmtool
 from pmsmtool.bus.connect import _why_closed
 from pmsmtool.commissioning.printed_page import BROWSER
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import machine_path
 from tests.cli.conftest import Tool
 
 

@@ -13,7 +13,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from pmsmtool.cli.failure import report
+from pmsmtool.cli.main import report
 from pmsmtool.cli.output import Output, jsonable, table
 from pmsmtool.errors import BusError
 from pmsmtool.plain_text import reason

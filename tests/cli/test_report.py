@@ -28,10 +28,10 @@ from pmsmtool.design.loops.open_loops import open_loops
 from pmsmtool.design.loops.sampled_loop import margins
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, IdentificationError
+from pmsmtool.files import data_folder
 from pmsmtool.identification.value_verdict import value_facts
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.report.verdict import Verdict, junit_xml
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage, new_record
 from pmsmtool.trace import Trace
 

@@ -21,7 +21,7 @@ from pmsmtool.cli.main import run as program
 from pmsmtool.cli.report import RELOAD
 from pmsmtool.commissioning.design_stages import lut_stage
 from pmsmtool.design.lookup.design import LookupRequest
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 from pmsmtool.run_directory import RECORD, RunDirectory, new_record
 
 pytestmark = [pytest.mark.wall_clock, pytest.mark.chain]

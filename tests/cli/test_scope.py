@@ -25,7 +25,7 @@ from pmsmtool.cli.live_server import MOST_CONNECTIONS, MOST_NUMBERS, MOST_ROWS, 
 from pmsmtool.commissioning.printed_page import find_browser
 from pmsmtool.errors import ConfigError
 from pmsmtool.report.report import template
-from pmsmtool.trace_file import read_trace
+from pmsmtool.trace import read_trace
 from tests.cli.conftest import Tool
 from tests.drive.served import serving
 

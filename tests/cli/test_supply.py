@@ -15,8 +15,7 @@ from pmsmtool.cli.identify import supply_reader
 from pmsmtool.cli.main import cli
 from pmsmtool.errors import Declined, NotAvailable
 from pmsmtool.identification.request import Method
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.measurement.capabilities import WAYS
 
 CHANNEL = "interior-2k2?nv=:memory:&drive=cia402"

@@ -19,8 +19,8 @@ from click.testing import CliRunner
 
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
-from pmsmtool.commissioning.closed_stage import LIMITS, NAMES, NO_BANDWIDTH, NO_INERTIA, why_no_limits
 from pmsmtool.commissioning.commission import Commissioning, begin_run, due_stages
+from pmsmtool.commissioning.design_stages import LIMITS, NAMES, NO_BANDWIDTH, NO_INERTIA, why_no_limits
 from pmsmtool.commissioning.level_stages import NO_STEPS, LevelStages
 from pmsmtool.commissioning.report_page import NO_DATA_SHEET, report_page, verdict
 from pmsmtool.design.closed_drive import RATED, SLOPE, SPEED, TORQUE
@@ -32,8 +32,9 @@ from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, Contradiction, ExitCode, IdentificationError, NotAvailable
+from pmsmtool.files import data_folder
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.run_files import REPLAYED
+from pmsmtool.identification.request import REPLAYED
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement import by_pulses
 from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, examine
@@ -42,7 +43,6 @@ from pmsmtool.papers.closed_drive import ClosedNode
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.proof.stage import ProofRequest
 from pmsmtool.report.verdict import ENCODER_SIGN
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim import channel
 from pmsmtool.sim.bus import PmsmSimBus

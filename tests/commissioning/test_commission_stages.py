@@ -34,12 +34,12 @@ from pmsmtool.errors import (
     SafetyRefusal,
     VerifyMismatch,
 )
+from pmsmtool.files import data_folder
 from pmsmtool.firmware.image import crc32
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.proof import stage as proof_stage
 from pmsmtool.proof.stage import ProofRequest
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage
 from pmsmtool.sim.bus import PmsmSimBus
 

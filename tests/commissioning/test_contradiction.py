@@ -13,11 +13,11 @@ import pytest
 from pmsmtool.commissioning.compared_stage import check_accepted
 from pmsmtool.commissioning.contradiction import ACCEPTABLE, HELD, OTHER_MOTOR, Row, compare
 from pmsmtool.errors import ConfigError, SafetyRefusal
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.params.parameter_set import default_set
 from pmsmtool.report.comparison import headline, marks, table_cells, unchecked
 from pmsmtool.report.report import verdict_of
-from pmsmtool.resources import data_folder
 
 TRUTH = replace(load_machine_file(data_folder("profiles") / "interior-2k2.toml"), std={})
 """No standard deviations: the tolerances of a catalogue hold."""

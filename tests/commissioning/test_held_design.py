@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.commissioning.held_design import held_design, why_not_judged
+from pmsmtool.commissioning.axis_design import held_design, why_not_judged
 from pmsmtool.design.closed_drive import RATED, SLOPE, STATED, TORQUE
 from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design, parse_design
 from pmsmtool.design.loops.margins import margin_report
@@ -23,8 +23,7 @@ from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, NotAvailable
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 
 FOREIGN = [name for name in family_names() if name != "pmsmsim"]
 TAKES = {"epos4": {"current_d", "current_q"}, "ingenia": {"current_d", "current_q"}}

@@ -20,9 +20,9 @@ from pmsmtool.commissioning.recomputed_page import loop_margins, recomputed
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.loops.margins import margin_problem
 from pmsmtool.design.tune import tune
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.report.report import template
-from pmsmtool.resources import data_folder
 
 PHASE_DEG = 0.5
 """Error of a phase margin below 90 deg between the nodes of the map; measured 0.25 on 1120 points of 14 drives."""

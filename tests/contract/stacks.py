@@ -14,7 +14,7 @@ import can
 import canopen
 
 from pmsmtool.bus.connect import Connection
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 from pmsmtool.sim.node.objects import ObjectRow, object_rows
 from tests.contract.contract import NODE, VENDOR, Peer
 

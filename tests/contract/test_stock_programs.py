@@ -15,7 +15,7 @@ from pathlib import Path
 import can
 import pytest
 
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 from tests.drive.served import ROOT, Server, serving
 
 pytestmark = pytest.mark.wall_clock

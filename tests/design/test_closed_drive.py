@@ -37,10 +37,9 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, DesignInfeasible, NotAvailable
-from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.files import data_folder
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_path
 from pmsmtool.papers.closed_drive import ClosedNode, Seat, closed_drive
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.simulated_machine import with_simulation
 

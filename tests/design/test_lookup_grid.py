@@ -29,8 +29,15 @@ from pmsmtool.design.lookup.grid import (
     lsb_a,
     table_words,
 )
-from pmsmtool.design.lookup.loci import loci
-from pmsmtool.design.lookup.table import CUT, LookupTable, electrical_speed, flux_table, speed_table, torque_limits
+from pmsmtool.design.lookup.table import (
+    CUT,
+    LookupTable,
+    electrical_speed,
+    flux_table,
+    loci,
+    speed_table,
+    torque_limits,
+)
 from pmsmtool.design.operating_machine import OperatingMachine
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.tune import tune

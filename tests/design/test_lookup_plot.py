@@ -6,10 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pmsmtool.design.lookup.loci import loci
-from pmsmtool.design.lookup.table import speed_table
+from pmsmtool.design.lookup.table import loci, speed_table
 from pmsmtool.design.operating_machine import OperatingMachine
-from pmsmtool.report.lookup_plot import lookup_figure
+from pmsmtool.report.plots import lookup_figure
 
 I_MAX = 150.0
 V_MAX = 60.0

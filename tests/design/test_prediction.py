@@ -12,8 +12,7 @@ import pytest
 from pmsmtool.design.prediction import LEAST_FACTOR, Direction, Prediction, predict
 from pmsmtool.errors import ConfigError
 from pmsmtool.npz_file import npz_bytes
-from pmsmtool.proof.judgement import SHAKES, judge, with_ripple
-from pmsmtool.proof.prediction_file import from_arrays, to_arrays
+from pmsmtool.proof.judgement import SHAKES, from_arrays, judge, to_arrays, with_ripple
 from pmsmtool.trace import Trace
 
 ROWS = 120

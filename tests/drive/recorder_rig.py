@@ -19,7 +19,7 @@ from pmsmtool.drive.recorders.reference import Recorder
 from pmsmtool.drive_maps import copley_objects, epos2_objects, ingenia_objects
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import machine_path
 from pmsmtool.sim.node.dictionary import Entry
 from pmsmtool.trace import Trace
 

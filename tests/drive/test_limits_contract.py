@@ -45,7 +45,7 @@ from pmsmtool.errors import (
     SafetyRefusal,
     StopNotConfirmed,
 )
-from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
+from pmsmtool.experiments.mechanics_run import acceleration_per_ampere
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import InverterParameters, MachineParameters
 from pmsmtool.sim.bus import PmsmSimBus

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from pmsmtool.drive import live_readings
-from pmsmtool.drive.live_readings import Column, available, readings, sent
+from pmsmtool.drive import logged_values
+from pmsmtool.drive.logged_values import Column, available, readings, sent
 from pmsmtool.drive.objects import IDENTITY, DriveObject
 from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, reference_map
 from pmsmtool.errors import DriveTimeout, NotAvailable
@@ -103,7 +103,7 @@ def silent_after(node: Node, sets: int, monkeypatch: pytest.MonkeyPatch) -> None
             live.received += 1
             live.values = dict.fromkeys(NAMES[: live.received], 1.0 * live.received)
 
-    monkeypatch.setattr(live_readings, "live_values", values)
+    monkeypatch.setattr(logged_values, "live_values", values)
     monkeypatch.setattr(node, "wait", wait)
 
 

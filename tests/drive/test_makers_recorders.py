@@ -20,7 +20,7 @@ from pmsmtool.drive_maps import copley_objects, epos2_objects, ingenia_objects
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveTimeout, NotAvailable, VerifyMismatch
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import machine_path
 from tests.drive.recorder_rig import KINDS, RIPPLE_HZ, RIPPLE_V, STEP_V, T_S, WHOLE_NS, Opener, Rig
 
 COMMANDED = pytest.mark.parametrize("opened", ["index", "rows", "rings"], indirect=True)

@@ -10,7 +10,7 @@ from canopen.objectdictionary import ODVariable
 from pmsmtool.drive import motion_objects, objects, set_point, standard_drive
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Recording, Shape
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 
 LETTERS = {0x02: "b", 0x03: "h", 0x04: "i", 0x05: "B", 0x06: "H", 0x07: "I", 0x08: "f"}
 

@@ -24,10 +24,9 @@ from pmsmtool.experiments.current_limit import (
     show_torque_limit,
     unproven,
 )
-from pmsmtool.experiments.shaft_answer import acceleration_per_ampere
+from pmsmtool.experiments.mechanics_run import acceleration_per_ampere
 from pmsmtool.identification.by_pulses import FACTS, dump_facts, read_facts
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.measurement.by_pulses import push_by_torque
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.node.factory import set_up_values

@@ -27,9 +27,9 @@ from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, Declined, IdentificationError, Interrupted, NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.files import data_folder
 from pmsmtool.identification.request import IdentifyRequest, Method
-from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file, machine_path
 from pmsmtool.measurement.by_pulses import HEADROOM, push_by_torque, swing_and_record, turn_both_ways
 from pmsmtool.measurement.capabilities import (
     FEATURES,
@@ -39,7 +39,6 @@ from pmsmtool.measurement.capabilities import (
     examine,
     reference_capabilities,
 )
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.simulated_machine import settings_of
 
 COMMANDS = (0x604000, 0x206007)

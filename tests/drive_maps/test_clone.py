@@ -17,10 +17,10 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement.clone import drawn_truth
-from pmsmtool.resources import data_folder
 
 
 def run(*arguments: str) -> Result:

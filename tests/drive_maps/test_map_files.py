@@ -13,9 +13,9 @@ from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, C
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, map_hash, parse_drive_map
 from pmsmtool.drive_maps.wire_units import counted_in, wire_unit
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import data_folder
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import ParameterSet
-from pmsmtool.resources import data_folder
 from pmsmtool.toml_file import line_of
 
 FOLDER = data_folder("firmware-params")

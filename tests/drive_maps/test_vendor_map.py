@@ -17,7 +17,7 @@ from pmsmtool.drive_maps.drive_map_file import dump_drive_map, map_hash, parse_d
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.drive_maps.wire_units import counted_in
 from pmsmtool.errors import ConfigError
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 from pmsmtool.toml_file import toml_text
 
 HEAD = """\

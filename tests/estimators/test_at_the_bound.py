@@ -17,6 +17,7 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators import estimate as gates
 from pmsmtool.estimators import resistance, tracking, tracking_model
 from pmsmtool.estimators.cross_check import JUDGES, CrossCheck
+from pmsmtool.estimators.current_sensors import LEAST, MINIMUM_SAMPLES, SURE, SensorMismatch, estimate_noise
 from pmsmtool.estimators.encoder import MINIMUM_TURNS, check_encoder_counts, estimate_encoder
 from pmsmtool.estimators.flux import linkage_rows
 from pmsmtool.estimators.flux.map_rows import smooth_angle
@@ -30,11 +31,8 @@ from pmsmtool.estimators.flux.voltage_flux import (
 from pmsmtool.estimators.injection import inductance, sampling_instant
 from pmsmtool.estimators.injection.inductance import _pulse_height
 from pmsmtool.estimators.injection.sampling_instant import Sampling
-from pmsmtool.estimators.injection.switching_ripple import Modulation
-from pmsmtool.estimators.inverter_error import InverterCurve, curve_from_levels
-from pmsmtool.estimators.noise import MINIMUM_SAMPLES, estimate_noise
+from pmsmtool.estimators.inverter_error import InverterCurve, Modulation, curve_from_levels
 from pmsmtool.estimators.resistance import Copper, copper_of, resistance_warmed
-from pmsmtool.estimators.sensor_mismatch import LEAST, SURE, SensorMismatch
 from pmsmtool.estimators.shaft.inertia_ratio import regress
 from pmsmtool.estimators.shaft.mechanics import require_useful
 from pmsmtool.estimators.shaft.model import DECAY_MOST, Run, _coast, _stops_after, positions

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import ExitCode, IdentificationError
+from pmsmtool.estimators.current_sensors import Noise, SensorMismatch, estimate_noise, widened, without_mismatch
 from pmsmtool.estimators.encoder import (
     JUMP_LIMIT_RAD,
     EncoderResult,
@@ -18,9 +19,7 @@ from pmsmtool.estimators.encoder import (
 )
 from pmsmtool.estimators.estimate import SensorTolerance, Verdict
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.resistance import ResistanceResult
-from pmsmtool.estimators.sensor_mismatch import SensorMismatch, widened, without_mismatch
 from pmsmtool.identification.phase_check import BALANCE_LIMIT, SMALL_LIMIT, check_pairs, check_phases, over_phases
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.refusals import REFUSALS, refuse

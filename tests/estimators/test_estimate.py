@@ -11,6 +11,7 @@ from scipy import optimize, stats
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.current_sensors import MINIMUM_SAMPLES, estimate_noise
 from pmsmtool.estimators.estimate import (
     CHI2_REFUSE,
     CHI2_WARN,
@@ -25,7 +26,6 @@ from pmsmtool.estimators.estimate import (
     total_half_width,
 )
 from pmsmtool.estimators.least_squares import DAMPING_START, central_jacobian, levenberg_marquardt, linear_solve
-from pmsmtool.estimators.noise import MINIMUM_SAMPLES, estimate_noise
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 

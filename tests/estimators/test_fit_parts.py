@@ -22,8 +22,7 @@ from pmsmtool.estimators.injection.axis_fit import DISPERSION_PENALTY, LEAST_R, 
 from pmsmtool.estimators.injection.axis_layout import Effects, Layout, Motion, Timing
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot
 from pmsmtool.estimators.injection.sampling_instant import CoastingPairs, shown_instant
-from pmsmtool.estimators.injection.switching_ripple import Modulation, edge_curve
-from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.inverter_error import InverterCurve, Modulation, edge_curve
 from pmsmtool.estimators.least_squares import Fit
 from pmsmtool.estimators.shaft import frequency_response as fr
 from pmsmtool.estimators.shaft import inertia_ratio, mechanics, swing

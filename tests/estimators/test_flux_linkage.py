@@ -24,8 +24,7 @@ from pmsmtool.estimators.flux.linkage import (
 from pmsmtool.estimators.flux.linkage_rows import fastest_pair, mean_inverter_error
 from pmsmtool.estimators.injection.inductance import InductanceResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling
-from pmsmtool.estimators.injection.switching_ripple import Modulation
-from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.inverter_error import InverterCurve, Modulation
 from pmsmtool.identification.evaluate import Evaluation, _beside_speeds, magnet_checked
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace

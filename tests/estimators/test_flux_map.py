@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from benchmarks.analytic_saturation import BridgeSaturation
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline, basis, break_points
 from pmsmtool.estimators.flux.map_fit import MagnetFlux, fit_coenergy
 from pmsmtool.estimators.flux.map_result import FluxMapResult, _axis, estimate_flux_map
 from pmsmtool.estimators.flux.map_rows import Frame, smooth_angle
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments.flux_map_scan import RECTANGLES, VOLTAGE_RATIOS
 from pmsmtool.machine.parameters import Estimate

@@ -45,8 +45,7 @@ from pmsmtool.estimators.flux.linkage_rows import (
     usable,
 )
 from pmsmtool.estimators.injection.sampling_instant import Sampling, course_s2, sampled_ripple
-from pmsmtool.estimators.injection.switching_ripple import Modulation, rippled_error_dq_v
-from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.inverter_error import InverterCurve, Modulation, rippled_error_dq_v
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 

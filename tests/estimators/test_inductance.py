@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, Verdict
 from pmsmtool.estimators.injection import axis_fit
 from pmsmtool.estimators.injection.angle_dependence import UNSEEN_RANGE
@@ -26,7 +27,6 @@ from pmsmtool.estimators.injection.inductance import (
 from pmsmtool.estimators.injection.output_error import AxisModel
 from pmsmtool.estimators.injection.sampling_instant import INSTANTS, LAGS, ShownInstant
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.identification.evaluate import Evaluation
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.identification.value_verdict import warnings_of

@@ -14,6 +14,7 @@ import pytest
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.estimate import SensorTolerance, Verdict
 from pmsmtool.estimators.injection import angle_dependence, inductance
 from pmsmtool.estimators.injection.angle_dependence import UNEVEN, UNSEEN_RANGE, AngleDependence, over_angle
@@ -23,7 +24,6 @@ from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, Volt
 from pmsmtool.estimators.injection.inductance import FrameAhead
 from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstant
 from pmsmtool.estimators.inverter_error import InverterCurve, curve_from_levels
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 

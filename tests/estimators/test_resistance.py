@@ -10,9 +10,9 @@ import pytest
 
 from benchmarks.peer_formulas import single_point_resistance, two_point_resistance
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, Verdict, total_half_width
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import (
     R_MEASURED,
     WITHIN_KNEE,

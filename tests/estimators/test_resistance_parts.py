@@ -14,9 +14,9 @@ from scipy.integrate import solve_ivp
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators import resistance
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance, Verdict
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import (
     FIT_FROM,
     HALF_WIDTH_LIMIT,

@@ -21,7 +21,7 @@ from pmsmtool.estimators.injection.sampling_instant import (
     shown_instant,
     standstill_instant_s,
 )
-from pmsmtool.estimators.injection.switching_ripple import Modulation
+from pmsmtool.estimators.inverter_error import Modulation
 
 T_S = 50e-6
 U_DC = 300.0

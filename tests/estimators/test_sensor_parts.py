@@ -12,9 +12,15 @@ import pytest
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.current_sensors import (
+    DOUBT,
+    Noise,
+    SensorMismatch,
+    estimate_mismatch,
+    widened,
+    without_mismatch,
+)
 from pmsmtool.estimators.encoder import INTEGER_LIMIT, check_encoder_counts, estimate_encoder
-from pmsmtool.estimators.noise import Noise
-from pmsmtool.estimators.sensor_mismatch import DOUBT, SensorMismatch, estimate_mismatch, widened, without_mismatch
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 

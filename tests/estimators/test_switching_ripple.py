@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pmsmtool.estimators.injection.switching_ripple import (
+from pmsmtool.estimators.inverter_error import (
+    InverterCurve,
     Modulation,
     edge_curve,
     phases_of,
     ripple_at_edges,
     rippled_error_dq_v,
 )
-from pmsmtool.estimators.inverter_error import InverterCurve
 
 MODULATION = Modulation(U_dc_v=300.0, L_h=(2e-3, 3e-3), period_s=1e-4, dead_time_s=0.0)
 STEPS = 20000

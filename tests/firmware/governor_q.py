@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pmsmtool.commissioning.export_q import LARGEST, ONE, fixed_point_files, q_files, q_format
+from pmsmtool.commissioning.export import LARGEST, ONE, fixed_point_files, q_files, q_format
 from pmsmtool.firmware.export_c import FLAGS
 from pmsmtool.native import parse_structs
 

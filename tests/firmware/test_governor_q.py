@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pmsmtool.commissioning.export_q import ONE, fixed_point_files, q_files, q_format
+from pmsmtool.commissioning.export import ONE, fixed_point_files, q_files, q_format
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.core_binding import core
 from pmsmtool.firmware.export_c import FLAGS

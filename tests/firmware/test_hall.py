@@ -21,9 +21,8 @@ from pmsmtool.machine.hall import HALL_ORDERS, HallCommutation
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.sim.closed_loop import drive_values
-from pmsmtool.sim.kernel import Part, Simulation
+from pmsmtool.sim.kernel import Part, Signal, Simulation, Truth
 from pmsmtool.sim.node.drive_core import ControlMode, HomingPhase
-from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import build_setup
 
 NONE, START, ALONE, STEPS = range(4)

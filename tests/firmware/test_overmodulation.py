@@ -18,8 +18,7 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError
 from pmsmtool.firmware.core_binding import core
-from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file, parse_machine
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file, machine_path, parse_machine
 from tests.firmware.closed_loop import (
     BEST,
     CURRENT_ROW,

@@ -22,7 +22,6 @@ from pmsmtool.papers import (
     polar_steps,
     polar_sweep,
 )
-from pmsmtool.papers.polar_measures import TorqueStep
 from pmsmtool.papers.polar_scene import (
     CONVENTIONAL,
     CONVENTIONAL_ON_MEASUREMENT,
@@ -45,6 +44,7 @@ from pmsmtool.papers.polar_scene import (
     run,
     steps,
 )
+from pmsmtool.papers.statistics import TorqueStep
 from tests.firmware.closed_loop import MODE_CURRENT, MODE_TORQUE, Loop
 from tests.firmware.test_polar_twin import RPM, U_DC, values
 

@@ -15,8 +15,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.firmware.core_binding import core
 from pmsmtool.firmware.export_c import FLAGS, c_files
 from pmsmtool.firmware.image import pack_image
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from tests.firmware.closed_loop import MODE_TORQUE, Loop
 
 pytestmark = pytest.mark.chain

@@ -13,10 +13,9 @@ from pmsmtool.design.tune import tune
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.sim.closed_loop import drive_values
-from pmsmtool.sim.kernel import Part, Simulation
+from pmsmtool.sim.kernel import Part, Signal, Simulation, Truth
 from pmsmtool.sim.node.drive_core import HomingPhase as Phase
 from pmsmtool.sim.node.drive_core import PositionFlag as Flag
-from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulated_machine import build_setup
 
 MODE_POSITION = 6

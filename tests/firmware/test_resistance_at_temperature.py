@@ -10,10 +10,10 @@ import pytest
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.files import data_folder
 from pmsmtool.firmware.core_binding import core
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.temperature import loop_coefficient_per_k, magnet_flux_at, resistance_at
-from pmsmtool.resources import data_folder
 from tests.firmware.closed_loop import MODE_CURRENT, Loop
 
 TOLERANCE = 2e-4

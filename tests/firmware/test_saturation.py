@@ -20,8 +20,7 @@ from pmsmtool.firmware.core_binding import core
 from pmsmtool.firmware.export_c import c_files
 from pmsmtool.firmware.image import ImageRefused, pack_image, saturation_words, unpack_image
 from pmsmtool.machine.flux_map import FluxMap
-from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_path
 from pmsmtool.papers.governed_drive import IDEAL
 from pmsmtool.params.parameter_set import SATURATION, ParameterSet, parse_parameter_set
 from pmsmtool.sim.closed_loop import simulate

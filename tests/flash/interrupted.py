@@ -15,9 +15,8 @@ from pmsmtool.firmware.image import crc32
 from pmsmtool.flash.download import set_named
 from pmsmtool.flash.restore import marks_of
 from pmsmtool.params.parameter_set import ParameterSet
-from pmsmtool.sim.node.memory import RamStorage
+from pmsmtool.sim.node.memory import IMAGE_KEY, RamStorage
 from pmsmtool.sim.node.parameter_set import ParameterImage
-from pmsmtool.sim.node.store import IMAGE_KEY
 from tests.flash.rig import WHEN, Rig, attach, open_rig
 
 How = Literal["power cut", "killed", "ctrl-c"]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.bus.busy import BUSY_POLL_S
+from pmsmtool.bus.sdo_transfer import BUSY_POLL_S
 from pmsmtool.bus.supervision import SecondMaster
 from pmsmtool.drive.parameters import BUSY_S, DriveParameters
 from pmsmtool.drive.port import Identity
@@ -29,7 +29,7 @@ from pmsmtool.flash.journal import MARKS, JournalFolder
 from pmsmtool.params.parameter_set import ParameterSet, default_set
 from pmsmtool.sim.line import Frame
 from pmsmtool.sim.node.dictionary import Refused
-from pmsmtool.sim.node.store import IMAGE_KEY
+from pmsmtool.sim.node.memory import IMAGE_KEY
 from tests.flash.rig import SMALL, Rig, attach, open_rig, with_tables
 
 

@@ -26,12 +26,11 @@ from pmsmtool.drive.guard import FRESH_S, OVERSHOOT, GuardedDrive
 from pmsmtool.drive.heartbeat import PERIOD_S
 from pmsmtool.drive.torque_drives import pushing_drive
 from pmsmtool.drive_maps.shipped_maps import family_of
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.measurement.by_pulses import push_by_torque
 from pmsmtool.sim.foreign.drive import ForeignDrive
+from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.node import Node
-from pmsmtool.sim.signals import Signal
 from tests.foreign.data_sheets import EXPECTED_PDO, GUARDING, Row, copley, epos4, write_eds
 
 LIGHTEST, HEAVIEST = 1.5e-4, 0.6

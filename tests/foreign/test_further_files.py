@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import machine_path
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import Row, epos4, unknown, write_eds

@@ -14,6 +14,7 @@ from pmsmtool.drive.objects import signal_unit
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.flux.voltage_flux import STEADY
 from pmsmtool.estimators.shaft.inertia_ratio import estimate_ratios
+from pmsmtool.experiments.mechanics_run import ShaftAnswer
 from pmsmtool.experiments.polled_push import (
     POLLED_RAMP_S,
     PolledPushPlan,
@@ -23,7 +24,6 @@ from pmsmtool.experiments.polled_push import (
     run_to_voltage,
     swing,
 )
-from pmsmtool.experiments.shaft_answer import ShaftAnswer
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.trace import Trace
 

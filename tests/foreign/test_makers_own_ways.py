@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.drive_maps.eds import parse_eds
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import machine_path
+from pmsmtool.sim.foreign.families import encoder_resolution
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
-from pmsmtool.sim.foreign.laws import encoder_resolution
 from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import COMMON, HEARTBEAT, TORQUE, Row, epos4, faulhaber, identity, write_eds
 

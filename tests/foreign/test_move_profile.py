@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.drive.guard import GuardedDrive
 from pmsmtool.drive.position_drive import PositionDrive
-from pmsmtool.experiments.move_profile import SPEED_WITHIN, find_profile
+from pmsmtool.experiments.move import SPEED_WITHIN, find_profile
 from pmsmtool.units import rad_s_from_rpm
 
 STEP_S = 1e-3

@@ -20,19 +20,18 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
+from pmsmtool.files import data_folder
 from pmsmtool.flash.download import Download
 from pmsmtool.flash.journal import JournalFolder
 from pmsmtool.flash.map_gate import memory_of
 from pmsmtool.flash.restore import plan_download
 from pmsmtool.identification.by_pulses import either_reading, over_torque_constant
 from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.measurement.capabilities import examine
 from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.params.parameter_set import ParameterSet
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import Stage
 from pmsmtool.sim.channel import parse_channel
 from tests.foreign.data_sheets import GUARDING, Row, copley, epos4, write_eds

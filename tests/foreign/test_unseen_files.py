@@ -18,8 +18,8 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.motion_objects import POSITION, position_units, rated_apk
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.errors import NotAvailable
-from pmsmtool.machine.profile import machine_path
-from pmsmtool.sim.foreign import laws
+from pmsmtool.machine.machine_file import machine_path
+from pmsmtool.sim.foreign import families
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.node.dictionary import Entry
 from tests.cli.conftest import Tool
@@ -212,7 +212,7 @@ arc, increments of the machine's encoder."""
 def test_the_unit_of_position_is_the_one_that_the_drive_states(tmp_path: Path, word: int, polarity: str) -> None:
     rows = unknown("0x2D", (0x60A8, 0, "U32", "rw", hex(word)), (0x607E, 0, "U8", "rw", polarity))
     path = write_eds(tmp_path / "x.eds", rows)
-    assert laws.position_units(read_makers_objects(str(path)), 131072) == pytest.approx(TURN[word])
+    assert families.position_units(read_makers_objects(str(path)), 131072) == pytest.approx(TURN[word])
     with opened(path) as node:
         assert position_units(node) == pytest.approx(TURN[word] * (-1.0 if polarity == "0x80" else 1.0))
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.flux.linkage import FluxResult
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.identification.evaluate import Evaluation
 from pmsmtool.identification.value_verdict import summary_of
 from pmsmtool.machine.parameters import Estimate

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.identification.mechanics import HARMONIC_PARTS, _harmonic_current
 from pmsmtool.trace import Trace
 

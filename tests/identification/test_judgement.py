@@ -16,9 +16,8 @@ from pmsmtool.identification.by_pulses import PulseFacts, pulse_result
 from pmsmtool.identification.completed_machine import completed_machine
 from pmsmtool.identification.request import Method
 from pmsmtool.identification.value_verdict import Judgement, judged, stage_of
-from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_path
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.trace import Trace
 
 ASKED = ("R", "L", "psi", "mechanics")

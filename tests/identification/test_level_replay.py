@@ -19,15 +19,14 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.errors import ConfigError, Declined, NotAvailable, Partial
 from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.files import data_folder
 from pmsmtool.identification.by_pulses import FACTS, OLDER_FACTS, PulseFacts, below_voltage, read_facts
 from pmsmtool.identification.by_vendor import ANSWERS
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.request import IdentifyRequest, Method
-from pmsmtool.identification.run_files import MACHINE, NAMEPLATE, REPLAYED
+from pmsmtool.identification.request import MACHINE, NAMEPLATE, REPLAYED, IdentifyRequest, Method
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.measurement.capabilities import Capabilities, examine
 from pmsmtool.measurement.identify import OF_LEVEL, identify, open_for_level
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, Stage
 from pmsmtool.sim.bus import PmsmSimBus
 

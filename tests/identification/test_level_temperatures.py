@@ -12,8 +12,7 @@ from pmsmtool.estimators.resistance import Copper, copper_of
 from pmsmtool.identification.by_pulses import PulseFacts, PulseResult, pulse_result
 from pmsmtool.identification.completed_machine import UNKNOWN_TEMPERATURE_K, completed_machine
 from pmsmtool.identification.request import Method
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from tests.estimators.test_recorded_push import PAIRS, T_S, swing
 
 WARM_C, RISE_K, ALPHA, ALPHA_PSI = 60.0, 40.0, 0.00393, -0.0012

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pmsmtool.axis.reference import Profile, plan
+from pmsmtool.axis.move import Profile, plan
 from pmsmtool.commissioning.contradiction import flux_doubt
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import total_half_width

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.estimate import SensorTolerance
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
 
 LEVELS = [sign * k / 12.0 for k in range(1, 13) for sign in (1.0, -1.0)] * 2

@@ -12,8 +12,7 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.errors import DriveFault, IdentificationError
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.run_files import MACHINE, REFUSED, refused_in
+from pmsmtool.identification.request import MACHINE, REFUSED, IdentifyRequest, refused_in
 from pmsmtool.identification.verdicts import DESIGNED_FROM, ESSENTIAL, STEP, blocking, verdicts_of
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import MachineParameters

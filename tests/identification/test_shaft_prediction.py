@@ -11,8 +11,8 @@ import pytest
 from benchmarks.mechanics_accuracy import realisation
 from pmsmtool.estimators.shaft.mechanics import TORQUE_FLOOR, estimate_mechanics
 from pmsmtool.estimators.shaft.position import encoder_step
-from pmsmtool.identification import shaft_prediction
-from pmsmtool.identification.shaft_prediction import PushPlan, RoughShaft, predict_mechanics, rough_friction
+from pmsmtool.identification import prediction
+from pmsmtool.identification.prediction import PushPlan, RoughShaft, predict_mechanics, rough_friction
 from pmsmtool.trace import Trace
 
 CURRENT_A = 4.0
@@ -26,8 +26,8 @@ KEYS = ("J_kgm2", "B_nms", "tau_c_nm")
 
 @pytest.mark.chain
 def test_the_prediction_is_what_the_fit_says_of_random_shafts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shaft_prediction, "RIPPLE", TORQUE_FLOOR)  # that of the realisations
-    monkeypatch.setattr(shaft_prediction, "SCALE_FLOOR", 0.0)
+    monkeypatch.setattr(prediction, "RIPPLE", TORQUE_FLOOR)  # that of the realisations
+    monkeypatch.setattr(prediction, "SCALE_FLOOR", 0.0)
     rng = np.random.default_rng(11)
     for _ in range(SHAFTS):
         traces, (J, B, tau_c), per_a, sigma = realisation(rng)

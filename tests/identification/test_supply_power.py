@@ -8,7 +8,7 @@ import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
-from pmsmtool.experiments.supply_levels import LEVELS
+from pmsmtool.experiments.standstill import LEVELS
 from pmsmtool.identification.supply_power import LOSS_DOUBT, SUPPLY_TOLERANCE, resistance_by_supply
 from pmsmtool.trace import Trace
 

@@ -13,17 +13,16 @@ from benchmarks.random_drives import true_loop_resistance
 from pmsmtool.bus.connect import Connection
 from pmsmtool.commissioning.contradiction import compare
 from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.files import data_folder
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.run_files import MACHINE, NAMEPLATE, stored_traces
+from pmsmtool.identification.request import MACHINE, NAMEPLATE, IdentifyRequest, stored_traces
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.identify import identify
 from pmsmtool.proof.simulated import as_tested
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, new_record
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.trace_file import trace_npz
+from pmsmtool.trace import trace_npz
 
 pytestmark = pytest.mark.chain
 

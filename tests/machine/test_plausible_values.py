@@ -6,8 +6,8 @@ import pytest
 from pmsmtool.design.design_file import design_text, parse_design
 from pmsmtool.design.tune import tune
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
-from pmsmtool.resources import data_folder
 
 PROFILES = sorted(data_folder("profiles").glob("*.toml"))
 MACHINE = """\

@@ -9,8 +9,8 @@ import pytest
 
 from pmsmtool.cli import main
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.profile import machine_path, profile_names
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
+from pmsmtool.machine.machine_file import machine_path, profile_names
 
 
 def test_a_profile_is_found_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

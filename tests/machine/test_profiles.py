@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from benchmarks.analytic_saturation import saturated_pmsyrm_map
+from pmsmtool.files import data_folder
 from pmsmtool.machine.flux_map_check import check_flux_map
 from pmsmtool.machine.flux_map_import import flux_map_csv
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
-from pmsmtool.resources import data_folder
 
 PROFILES = sorted(path.stem for path in data_folder("profiles").glob("*.toml"))
 

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pmsmtool.design.loops.speed_loop import TORQUE_SHARE, speed_noise
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.speed_noise import TORQUE_SHARE, speed_noise
 
 NOISE_RAD = 2.5e-3
 WITHIN = 0.06

@@ -19,6 +19,7 @@ from pmsmtool.cli.main import run as main
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.errors import ConfigError, ExitCode, NotAvailable
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
+from pmsmtool.files import data_folder
 from pmsmtool.identification.prediction import Prediction
 from pmsmtool.identification.request import IdentifyRequest, accuracy_facts, accuracy_line, dump_request, parse_request
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
@@ -39,10 +40,9 @@ from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import starting_gains
 from pmsmtool.measurement.speeds import SpeedStage
 from pmsmtool.report.verdict import verdict_of
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.trace_file import read_trace
+from pmsmtool.trace import read_trace
 
 MOST_S = 27.0
 """Machine time of all default quantities of ``interior-2k2`` with 1 %; measured: 25.2 s, without an accuracy 46.5 s."""

@@ -15,23 +15,21 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import NotAvailable
+from pmsmtool.estimators.current_sensors import Noise, estimate_noise
 from pmsmtool.estimators.flux.map_fit import MagnetFlux
 from pmsmtool.estimators.flux.map_result import estimate_flux_map
 from pmsmtool.estimators.flux.map_rows import Frame
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.noise import Noise, estimate_noise
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import standstill
 from pmsmtool.identification.flux_map import MAP_CSV, MAP_FILE, MAP_INTERVALS
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.run_files import stored_traces
+from pmsmtool.identification.request import IdentifyRequest, stored_traces
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.flux_map_check import check_flux_map
 from pmsmtool.machine.flux_map_import import load_flux_map
-from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file, machine_path
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.measurement import measure
 from pmsmtool.measurement.by_injection import envelope_of, nameplate_of
 from pmsmtool.measurement.flux_map import IF_SATURATED, measure_map, plan_lines

@@ -33,11 +33,9 @@ from pmsmtool.identification.mechanics import (
     with_play_told,
 )
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.run_files import MACHINE, PREDICTED
-from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.identification.request import MACHINE, PREDICTED, IdentifyRequest
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.machine.profile import machine_path
 from pmsmtool.machine.two_masses import SWING, shafts_of
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.frequency_response import PLAN_LINE

@@ -21,19 +21,18 @@ from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.errors import ConfigError, ExitCode, IdentificationError, Interrupted, NotAvailable
 from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.files import data_folder
 from pmsmtool.identification.evaluate import tolerance_on
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.request import REQUEST, IdentifyRequest, dump_request, parse_request
-from pmsmtool.identification.run_files import MACHINE, REPLAYED
+from pmsmtool.identification.request import MACHINE, REPLAYED, REQUEST, IdentifyRequest, dump_request, parse_request
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.identify import identify
 from pmsmtool.measurement.square_waves import BIAS_MOST, CROSSING, RIPPLE_LEAST, bias_and_ripple
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.simulated_machine import settings_of
-from pmsmtool.trace_file import read_trace
+from pmsmtool.trace import read_trace
 
 pytestmark = pytest.mark.chain
 

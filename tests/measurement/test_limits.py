@@ -14,13 +14,13 @@ from click.testing import CliRunner
 from pmsmtool.cli.main import cli
 from pmsmtool.errors import ConfigError, IdentificationError
 from pmsmtool.experiments.rotation import SLOWEST_STEP_S, STEP_RAD, dwell_within
+from pmsmtool.files import data_folder
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import MachineLimits
 from pmsmtool.measurement.by_injection import envelope_of, nameplate_of, plan_lines
 from pmsmtool.measurement.limits import LEAST_CURRENT, LEAST_SPEED_SHARE, Limits, require_speed, unused_current
 from pmsmtool.params.catalogue import BY_NAME
-from pmsmtool.resources import data_folder
 
 WEAK_SUPPLY = 0.01
 """Of L_d, L_q, psi_f and J behind 25 ohm: 0.6, 0.3, 0.2 and 0.3 % were found."""

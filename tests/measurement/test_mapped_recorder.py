@@ -30,8 +30,7 @@ from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.recorded_push import DELAY_DOUBT, estimate_pushes
 from pmsmtool.identification.by_pulses import PulseResult, pulse_result
 from pmsmtool.identification.request import Method
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.measurement.by_pulses import swing_and_record
 from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, examine
 from pmsmtool.measurement.identify import open_for_level

@@ -28,14 +28,14 @@ from pmsmtool.experiments.mechanics_run import (
     plan_mechanics,
     push_and_coast,
 )
+from pmsmtool.files import data_folder
 from pmsmtool.identification.evaluate import evaluate
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.measurement.by_injection import envelope_of, nameplate_of
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
-from pmsmtool.measurement.shaft_forecast import ShaftForecast
-from pmsmtool.resources import data_folder
+from pmsmtool.measurement.mechanics import ShaftForecast
 from pmsmtool.sim.simulated_machine import settings_of, with_simulation
 from pmsmtool.trace import Trace
 

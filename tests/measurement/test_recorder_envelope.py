@@ -15,8 +15,7 @@ import pytest
 
 from pmsmtool.cli.main import run as program
 from pmsmtool.experiments.polled_push import VOLTAGE_SHARE, PushPlan, _slower
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace
+from pmsmtool.trace import Trace, read_trace
 from tests.simulated_bus import settle
 
 

@@ -10,8 +10,21 @@ import numpy as np
 import pytest
 
 from pmsmtool.estimators.encoder import estimate_encoder
-from pmsmtool.experiments.rotation import QUICK_DWELL_S, QUICK_STEP_RAD, SWING, RotationPlan, rotate_vector, step_within
-from pmsmtool.experiments.vector_turn import BRAKED_S, LOOK_S, RAMP_S, REST_LIMIT_S, come_to_rest, rising, turn_vector
+from pmsmtool.experiments.rotation import (
+    BRAKED_S,
+    LOOK_S,
+    QUICK_DWELL_S,
+    QUICK_STEP_RAD,
+    RAMP_S,
+    REST_LIMIT_S,
+    SWING,
+    RotationPlan,
+    come_to_rest,
+    rising,
+    rotate_vector,
+    step_within,
+    turn_vector,
+)
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import ROTATIONS, Measurement
 from pmsmtool.trace import Trace

@@ -18,7 +18,7 @@ from pmsmtool.drive.port import Identity
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import IdentificationError
-from pmsmtool.experiments.vector_turn import FIRST_SHARE, LEAD_S, lead_onto_vector
+from pmsmtool.experiments.rotation import FIRST_SHARE, LEAD_S, lead_onto_vector
 from pmsmtool.identification.by_pulses import PulseFacts, pulse_result
 from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file

@@ -12,8 +12,8 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.vendor_tuning import VendorDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.session import Session
 

@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.drive_core import (
     TRACE_BYTES,
     Averages,
@@ -24,7 +25,6 @@ from pmsmtool.sim.node.drive_core import (
     Trigger,
 )
 from pmsmtool.sim.node.parameter_set import ParameterImage
-from pmsmtool.sim.signals import Signal
 
 R_OHM, L_H = 0.5, 0.002
 CURRENT_SHARE = 0.2

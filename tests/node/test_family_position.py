@@ -11,7 +11,7 @@ from pmsmtool.bus.connect import connect
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive_maps.shipped_maps import load_family
-from pmsmtool.sim.node.family_position import PID, cascade_of, pid_of
+from pmsmtool.sim.node.position_modes import PID, cascade_of, pid_of
 
 
 @pytest.mark.parametrize(("K_p", "K_i", "K_v"), [(0.9, 13.5, 15.0), (2.0, 40.0, 12.0), (0.1, 0.0, 9.0)])

@@ -11,9 +11,9 @@ import pytest
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.drive.port import Injection, Shape
+from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.measurement import LIVE_SIGNALS
 from pmsmtool.sim.node.objects import object_rows
-from pmsmtool.sim.signals import Signal
 from tests.node.bench import Bench
 from tests.node.raw_client import Aborted, RawClient
 

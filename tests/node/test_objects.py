@@ -14,8 +14,8 @@ import pytest
 from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
+from pmsmtool.files import data_folder
 from pmsmtool.params.catalogue import CATALOGUE, layout_signature
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.node.dictionary import Dictionary
 from pmsmtool.sim.node.eds import FILE_NAME, MAP_NAME, eds_text
 from pmsmtool.sim.node.objects import ObjectRow, build_rows, object_rows

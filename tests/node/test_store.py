@@ -11,7 +11,7 @@ import pytest
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import CATALOGUE
-from pmsmtool.sim.node import store as storing
+from pmsmtool.sim.node import memory as storing
 from pmsmtool.sim.node.memory import Memory, RamStorage
 from tests.node.bench import Bench, steps_of
 from tests.node.conftest import BenchMaker

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.packaging import backend, build_kernels, compiler
-from pmsmtool.packaging.kernels import here
+from pmsmtool.packaging.compiler import here
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -17,9 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from pmsmtool.packaging import wheel
-from pmsmtool.packaging.compiler import CANDIDATES
-from pmsmtool.packaging.kernels import KERNELS
+from pmsmtool.packaging import backend
+from pmsmtool.packaging.compiler import CANDIDATES, KERNELS
 
 ROOT = Path(__file__).resolve().parents[2]
 NO_INDEX = ("No matching distribution found for", "Could not find a version that satisfies", "ConnectionError")
@@ -32,7 +31,7 @@ pytestmark = [
 PROBE = """
 import sys
 from pmsmtool.native import LIBRARY_FOLDER, load
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 for name in sys.argv[1:]:
     load(name)
 print(LIBRARY_FOLDER)
@@ -62,10 +61,10 @@ class Installation:
 def install(folder: Path) -> Installation:
     """Install a copy of this checkout in a fresh environment, where no compiler is found."""
     sources = folder / "checkout"
-    for name, path in wheel.source_files(ROOT).items():
+    for name, path in backend.source_files(ROOT).items():
         (sources / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(path, sources / name)
-    for name in wheel.DATA_FOLDERS:
+    for name in backend.DATA_FOLDERS:
         (sources / name).mkdir(exist_ok=True)
     venv.create(folder / "environment", with_pip=False)
     python = folder / "environment" / "bin" / "python"
@@ -83,7 +82,7 @@ def install(folder: Path) -> Installation:
 
 def data_lines(root: Path) -> list[str]:
     """What the probe prints for the data folders that stand in ``root``."""
-    files = {name: [p for p in wheel.source_files(ROOT) if p.startswith(f"{name}/")] for name in wheel.DATA_FOLDERS}
+    files = {name: [p for p in backend.source_files(ROOT) if p.startswith(f"{name}/")] for name in backend.DATA_FOLDERS}
     return [
         " ".join([str(root / name), *(p.removeprefix(f"{name}/") for p in sorted(found))])
         for name, found in files.items()
@@ -95,8 +94,8 @@ def test_installed_wheel_has_kernels_and_data_and_leaves_the_sources_clean(tmp_p
     assert "compiled by ziglang" in found.log
     package = next((tmp_path / "environment").rglob("site-packages")) / "pmsmtool"
     assert found.probe(tmp_path) == [str(package / "_native"), *data_lines(package / "_data")]
-    left = {path.name for path in found.sources.iterdir()} - {name.split("/")[0] for name in wheel.source_files(ROOT)}
-    assert left <= set(wheel.DATA_FOLDERS)
+    left = {path.name for path in found.sources.iterdir()} - {name.split("/")[0] for name in backend.source_files(ROOT)}
+    assert left <= set(backend.DATA_FOLDERS)
     assert not (found.sources / "pmsmtool" / "_native").exists()
     help_text = subprocess.run([tmp_path / "environment/bin/pmsmtool", "--version"], capture_output=True, text=True)
     assert "No module named 'click'" in help_text.stderr  # the entry point is there; its dependencies were left out

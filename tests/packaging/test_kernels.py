@@ -11,9 +11,9 @@ import pytest
 
 from pmsmtool import native
 from pmsmtool.errors import PmsmtoolError
-from pmsmtool.packaging import build_kernels, compiler, cross_wheels, kernels
-from pmsmtool.packaging.kernels import KERNELS, Kernel, here
-from pmsmtool.packaging.symbols import read_binary
+from pmsmtool.packaging import build_kernels, compiler, cross_wheels
+from pmsmtool.packaging.compiler import KERNELS, Kernel, here
+from pmsmtool.packaging.cross_wheels import read_binary
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "pmsmtool"
@@ -43,7 +43,7 @@ def test_kernel_compiles_without_a_warning_and_exports_only_its_prefix(
 ) -> None:
     """Without defines of its own, its sources are compiled below, and its library is the one that is built."""
     library = native.LIBRARY_FOLDER / native.library_name(kernel.name)
-    if kernel.defines or not kernels.is_current(library, kernel, PACKAGE):
+    if kernel.defines or not compiler.is_current(library, kernel, PACKAGE):
         library = tmp_path / library.name
         compiler.compile_library(working_compiler, kernel, PACKAGE, library, strict=True)
         assert [path.name for path in tmp_path.iterdir()] == [library.name]
@@ -59,8 +59,8 @@ def test_each_source_compiles_without_a_warning_and_its_symbols_have_the_prefix(
 ) -> None:
     """Linked statically into a firmware, hidden symbols meet those of others as well: every one has the prefix."""
     target = tmp_path / "unit.o"
-    includes = [part for folder in kernels.INCLUDE_FOLDERS for part in ("-iquote", folder)]
-    flags = (*kernels.COMPILE_FLAGS, *kernels.WARNING_FLAGS, *working_compiler.tolerated)
+    includes = [part for folder in compiler.INCLUDE_FOLDERS for part in ("-iquote", folder)]
+    flags = (*compiler.COMPILE_FLAGS, *compiler.WARNING_FLAGS, *working_compiler.tolerated)
     command = [*working_compiler.command, *flags, *includes, "-c", source.as_posix(), "-o", str(target)]
     subprocess.run(command, cwd=PACKAGE, check=True)
     data = target.read_bytes()
@@ -94,7 +94,10 @@ def test_a_missing_function_is_found_when_linking(working_compiler: compiler.Com
 def test_same_source_same_bytes(working_compiler: compiler.Compiler, tmp_path: Path) -> None:
     """Also from another folder: no path of the building machine gets into a library."""
     smallest = KERNELS[-1]
-    for source in (*smallest.source_files(PACKAGE), *(p for pattern in kernels.HEADERS for p in PACKAGE.glob(pattern))):
+    for source in (
+        *smallest.source_files(PACKAGE),
+        *(p for pattern in compiler.HEADERS for p in PACKAGE.glob(pattern)),
+    ):
         copy = tmp_path / "one" / "pmsmtool" / (source.relative_to(PACKAGE) if source.is_absolute() else source)
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(PACKAGE / source, copy)

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.packaging import compiler, cross_wheels
-from pmsmtool.packaging.kernels import COMPILE_FLAGS, TARGETS, Target
-from pmsmtool.packaging.symbols import Binary, read_binary
+from pmsmtool.packaging.compiler import COMPILE_FLAGS, TARGETS, Target
+from pmsmtool.packaging.cross_wheels import Binary, read_binary
 
 SOURCE = """\
 #include <string.h>

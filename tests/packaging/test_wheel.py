@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from pmsmtool import resources
+from pmsmtool import files
 from pmsmtool.errors import ConfigError, PmsmtoolError
-from pmsmtool.packaging import cross_wheels, wheel
+from pmsmtool.packaging import backend, cross_wheels
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -33,7 +33,9 @@ def metadata(tmp_path: Path) -> Path:
 def test_wheel_is_complete_described_and_reproducible(metadata: Path, tmp_path: Path) -> None:
     source = tmp_path / "a.py"
     source.write_text("x = 1\n")
-    first = wheel.write_wheel(tmp_path, metadata, "py3-none-linux_x86_64", {"thing/b.so": b"\0", "thing/a.py": source})
+    first = backend.write_wheel(
+        tmp_path, metadata, "py3-none-linux_x86_64", {"thing/b.so": b"\0", "thing/a.py": source}
+    )
     assert first.name == "thing-1.0-py3-none-linux_x86_64.whl"
     with zipfile.ZipFile(first) as archive:
         assert archive.namelist() == [
@@ -49,12 +51,12 @@ def test_wheel_is_complete_described_and_reproducible(metadata: Path, tmp_path: 
         assert cross_wheels.record_faults(archive) == []
     content = first.read_bytes()
     os.utime(source, (0, 0))
-    wheel.write_wheel(tmp_path, metadata, "py3-none-linux_x86_64", {"thing/a.py": source, "thing/b.so": b"\0"})
+    backend.write_wheel(tmp_path, metadata, "py3-none-linux_x86_64", {"thing/a.py": source, "thing/b.so": b"\0"})
     assert first.read_bytes() == content
 
 
 def test_a_changed_file_is_not_described_by_its_record(metadata: Path, tmp_path: Path) -> None:
-    built = wheel.write_wheel(tmp_path, metadata, "py3-none-any", {"thing/a.py": b"x = 1\n"})
+    built = backend.write_wheel(tmp_path, metadata, "py3-none-any", {"thing/a.py": b"x = 1\n"})
     changed = tmp_path / "changed.whl"
     with zipfile.ZipFile(built) as old, zipfile.ZipFile(changed, "w") as new:
         for name in old.namelist():
@@ -68,13 +70,13 @@ def test_a_changed_file_is_not_described_by_its_record(metadata: Path, tmp_path:
 def test_source_archive_is_reproducible(metadata: Path, tmp_path: Path) -> None:
     source = tmp_path / "a.py"
     source.write_text("x = 1\n")
-    first = wheel.write_source_archive(tmp_path, "thing-1.0", metadata, {"thing/a.py": source, ".ci/run": source})
+    first = backend.write_source_archive(tmp_path, "thing-1.0", metadata, {"thing/a.py": source, ".ci/run": source})
     content = first.read_bytes()
     with tarfile.open(first) as archive:
         assert archive.getnames() == ["thing-1.0/.ci/run", "thing-1.0/PKG-INFO", "thing-1.0/thing/a.py"]
         assert [entry.mode for entry in archive.getmembers()] == [0o755, 0o644, 0o644]
     os.utime(source, (0, 0))
-    wheel.write_source_archive(tmp_path, "thing-1.0", metadata, {".ci/run": source, "thing/a.py": source})
+    backend.write_source_archive(tmp_path, "thing-1.0", metadata, {".ci/run": source, "thing/a.py": source})
     assert first.read_bytes() == content
 
 
@@ -86,11 +88,11 @@ def tracked() -> list[str]:
 
 
 def test_every_tracked_file_has_its_place() -> None:
-    in_wheel = set(wheel.package_files(ROOT).values())
-    package = [name for name in tracked() if name.startswith(("pmsmtool/", *(f"{f}/" for f in wheel.DATA_FOLDERS)))]
+    in_wheel = set(backend.package_files(ROOT).values())
+    package = [name for name in tracked() if name.startswith(("pmsmtool/", *(f"{f}/" for f in backend.DATA_FOLDERS)))]
     assert package
     assert [name for name in package if ROOT / name not in in_wheel] == []
-    in_archive = set(wheel.source_files(ROOT))
+    in_archive = set(backend.source_files(ROOT))
     assert [name for name in tracked() if name not in in_archive] == []
 
 
@@ -100,24 +102,22 @@ def test_nothing_generated_is_packed(tmp_path: Path) -> None:
         (tmp_path / name).write_text("")
     (tmp_path / "pmsmtool" / "__pycache__").mkdir()
     (tmp_path / "pmsmtool" / "__pycache__" / "a.py").write_text("")
-    assert set(wheel.package_files(tmp_path)) == {"pmsmtool/a.py", "pmsmtool/_data/profiles/p.toml"}
+    assert set(backend.package_files(tmp_path)) == {"pmsmtool/a.py", "pmsmtool/_data/profiles/p.toml"}
 
 
 @pytest.mark.parametrize("name", ["profiles", "firmware-params"])
-def test_data_folder_from_either_place(
-    name: resources.DataFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_data_folder_from_either_place(name: files.DataFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = tmp_path / "pmsmtool"
-    monkeypatch.setattr(resources, "_PACKAGE", package)
+    monkeypatch.setattr(files, "_PACKAGE", package)
     with pytest.raises(PmsmtoolError, match="install pmsmtool again"):
-        resources.data_folder(name)
+        files.data_folder(name)
     (tmp_path / name).mkdir()
     with pytest.raises(PmsmtoolError):  # beside an installed package: somebody else's folder
-        resources.data_folder(name)
+        files.data_folder(name)
     (tmp_path / "pyproject.toml").write_text("")
-    assert resources.data_folder(name) == tmp_path / name
+    assert files.data_folder(name) == tmp_path / name
     (package / "_data" / name).mkdir(parents=True)
-    assert resources.data_folder(name) == package / "_data" / name
+    assert files.data_folder(name) == package / "_data" / name
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_user_folder(
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(sys, "platform", platform)
     monkeypatch.setattr(Path, "home", lambda: Path("/h"))
-    assert resources.user_folder() == Path(expected)
+    assert files.user_folder() == Path(expected)
 
 
 def test_user_without_a_home_is_told_what_to_set(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,4 +150,4 @@ def test_user_without_a_home_is_told_what_to_set(monkeypatch: pytest.MonkeyPatch
     monkeypatch.delenv("PMSMTOOL_HOME", raising=False)
     monkeypatch.setattr(Path, "home", homeless)
     with pytest.raises(ConfigError, match="PMSMTOOL_HOME"):
-        resources.user_folder()
+        files.user_folder()

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from pmsmtool.papers import polar_limit, polar_linear, polar_measures, polar_steps, polar_sweep
+from pmsmtool.papers import polar_limit, polar_linear, polar_steps, polar_sweep, statistics
 from pmsmtool.papers.figure import Reproduction
 from pmsmtool.papers.polar_scene import (
     BASELINES,
@@ -88,9 +88,9 @@ def response(i_d: np.ndarray, i_q: np.ndarray, delta: np.ndarray | None = None) 
 
 def test_settling_counts_to_the_last_sample_outside() -> None:
     t = 1e-3 * np.arange(5)
-    assert polar_measures.settling_ms(t, np.array([0.0, 1.2, 1.0, 1.2, 1.0]), 1.0, 0.1) == pytest.approx(4.0)
-    assert polar_measures.settling_ms(t, np.ones(5), 1.0, 0.1) == 0.0
-    assert math.isinf(polar_measures.settling_ms(t, np.array([1.0, 1.0, 1.0, 1.0, 1.2]), 1.0, 0.1))
+    assert statistics.settling_ms(t, np.array([0.0, 1.2, 1.0, 1.2, 1.0]), 1.0, 0.1) == pytest.approx(4.0)
+    assert statistics.settling_ms(t, np.ones(5), 1.0, 0.1) == 0.0
+    assert math.isinf(statistics.settling_ms(t, np.array([1.0, 1.0, 1.0, 1.0, 1.2]), 1.0, 0.1))
 
 
 def test_torque_step_measures() -> None:
@@ -100,7 +100,7 @@ def test_torque_step_measures() -> None:
     i_q[420] = high + 0.1 * (high - low)
     i_d = np.zeros(1200)
     i_d[810:820] = 2.0
-    m = polar_measures.torque_step(response(i_d, i_q), 0.04, 0.08, 1.0, 3.0)
+    m = statistics.torque_step(response(i_d, i_q), 0.04, 0.08, 1.0, 3.0)
     assert m.up_ms == pytest.approx(2.1)
     assert (m.over_up, m.over_down) == pytest.approx((10.0, 0.0))
     assert (m.peak_a, m.area_mas) == pytest.approx((2.0, 2.0))
@@ -110,14 +110,14 @@ def test_torque_step_measures() -> None:
 def test_phase_steps_are_counted_modulo_pi() -> None:
     delta = np.tile([1.5, -1.5], 50)
     r = response(np.zeros(100), np.zeros(100), delta)
-    assert polar_measures.phase_step_rms(r, 0.0) == pytest.approx(math.pi - 3.0)
+    assert statistics.phase_step_rms(r, 0.0) == pytest.approx(math.pi - 3.0)
 
 
 def test_bump_is_what_deviates_from_the_slow_error() -> None:
     i_q = np.zeros(2000)
     i_q[1000:1010] = 1.0
     r = response(np.zeros(2000), i_q)
-    assert polar_measures.torque_bump(r, 0.05, 0.15) == pytest.approx(K_T * (1 - 10 / 200))
+    assert statistics.torque_bump(r, 0.05, 0.15) == pytest.approx(K_T * (1 - 10 / 200))
 
 
 # ---- modulation ------------------------------------------------------------------------------------------------

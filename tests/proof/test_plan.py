@@ -16,6 +16,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.port import Injection
 from pmsmtool.errors import NotAvailable
 from pmsmtool.estimators.resistance import R_MEASURED
+from pmsmtool.files import data_folder
 from pmsmtool.identification.frequency_response import RIGID, SHOWN
 from pmsmtool.identification.mechanics import PLAY_FALLBACK
 from pmsmtool.identification.sampling import INSTANT, LAG
@@ -24,12 +25,12 @@ from pmsmtool.machine.parameters import Estimate, InverterParameters, MachinePar
 from pmsmtool.machine.temperature import WARMING
 from pmsmtool.machine.torque import iron_drag, torque_per_ampere
 from pmsmtool.machine.two_masses import INERTIA, PLAY_FACTOR, REFUSED, SWING, TORQUE_NOISE, UNSEEN
+from pmsmtool.proof.conditions import Conditions
 from pmsmtool.proof.drawn_machine import EMF_HARMONICS, FRICTION_FACTOR, LAG_SHARES, LATE_SHARE
 from pmsmtool.proof.judgement import LEAST_STEADY_ROWS
-from pmsmtool.proof.plan import LONGEST_S, SIGNALS, STEPS, WEAKENING_SLOPE, Conditions, _apart, plan_proof
+from pmsmtool.proof.plan import LONGEST_S, SIGNALS, STEPS, WEAKENING_SLOPE, _apart, plan_proof
 from pmsmtool.proof.simulated import BASE_SPEED, SimulatedDrives, as_tested
 from pmsmtool.proof.stage import ProofRequest, envelope_of
-from pmsmtool.resources import data_folder
 from pmsmtool.units import RAD_S_PER_RPM
 
 

@@ -33,6 +33,7 @@ from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.errors import Declined, Interrupted, VerifyMismatch
+from pmsmtool.files import data_folder
 from pmsmtool.flash.restore import take_backup
 from pmsmtool.identification.wiring import SUPPLY
 from pmsmtool.machine.key import Value
@@ -41,8 +42,8 @@ from pmsmtool.machine.temperature import WARMING
 from pmsmtool.measurement.limits import LEAST_CURRENT
 from pmsmtool.proof import measured
 from pmsmtool.proof import stage as stages
+from pmsmtool.proof.conditions import Conditions
 from pmsmtool.proof.judgement import judge, with_ripple
-from pmsmtool.proof.plan import Conditions
 from pmsmtool.proof.stage import (
     ProofRequest,
     _beyond,
@@ -53,7 +54,6 @@ from pmsmtool.proof.stage import (
     read_proof,
     responses,
 )
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RECORD, RunDirectory, Stage
 from pmsmtool.sim.kernel import Params
 from pmsmtool.units import RAD_S_PER_RPM

@@ -24,13 +24,14 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import GuardedDrive
+from pmsmtool.files import data_folder
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.proof import stage as stages
-from pmsmtool.proof.plan import Conditions, ProofPlan, plan_proof
+from pmsmtool.proof.conditions import Conditions
+from pmsmtool.proof.plan import ProofPlan, plan_proof
 from pmsmtool.proof.simulated import SimulatedDrives
 from pmsmtool.proof.stage import ProofRequest, prove_stage
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import Stage
 
 pytestmark = pytest.mark.chain

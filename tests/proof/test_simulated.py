@@ -11,12 +11,13 @@ import pytest
 
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.proof.conditions import Conditions
 from pmsmtool.proof.drawn_machine import bend_of
-from pmsmtool.proof.plan import Conditions, plan_proof
+from pmsmtool.proof.plan import plan_proof
 from pmsmtool.proof.simulated import SimulatedDrives
-from pmsmtool.resources import data_folder
 
 pytestmark = pytest.mark.chain
 

@@ -18,13 +18,12 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from pmsmtool import native
+from pmsmtool.files import data_folder
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.flux_map import FluxMap
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
-from pmsmtool.resources import data_folder
-from pmsmtool.sim.kernel import Application, Params, Part, Reference, Rotor, Setup, Simulation, Target
-from pmsmtool.sim.signals import Truth
+from pmsmtool.sim.kernel import Application, Params, Part, Reference, Rotor, Setup, Simulation, Target, Truth
 
 T_S_NS = 83333
 """Control period of all scenarios (ns), 12 kHz."""

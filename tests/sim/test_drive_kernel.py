@@ -12,10 +12,11 @@ import pytest
 
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import data_folder
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.drive_kernel import IDEAL_ENCODER_COUNTS, KernelCore, create
+from pmsmtool.sim.kernel import Signal, Truth
 from pmsmtool.sim.node.drive_core import (
     AverageState,
     Command,
@@ -26,7 +27,6 @@ from pmsmtool.sim.node.drive_core import (
     RecorderState,
     Trigger,
 )
-from pmsmtool.sim.signals import Signal, Truth
 from pmsmtool.sim.simulate import find_drive
 from pmsmtool.sim.simulated_machine import with_simulation
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.channel import erase_memory, parse_channel, simulated_machine_file
 
 

@@ -11,9 +11,9 @@ import pytest
 from benchmarks.link_events import ALLOWED, EVENTS, LOADS, run
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.tune import tune
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.uncontrolled_generation import SPEED_ROOM, generation_rpm
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import simulate
 from pmsmtool.sim.kernel import Application
 from pmsmtool.sim.scenarios import Scenario

@@ -8,8 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from pmsmtool.sim.kernel import Rotor, Simulation, Target
-from pmsmtool.sim.signals import Truth
+from pmsmtool.sim.kernel import Rotor, Simulation, Target, Truth
 from tests.sim.bench import (
     L_D,
     L_Q,

@@ -15,9 +15,9 @@ from pmsmtool.machine.flux_map_cells import library
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import simulate
+from pmsmtool.sim.kernel import Signal, Truth
 from pmsmtool.sim.monte_carlo import DriveRuns, Variation, cores, simulate_many
 from pmsmtool.sim.scenarios import Scenario
-from pmsmtool.sim.signals import Signal, Truth
 from tests.sim.bench import U_DC, values
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"

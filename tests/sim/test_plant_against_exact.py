@@ -11,8 +11,7 @@ import pytest
 from scipy.linalg import expm
 
 from pmsmtool.firmware.image import pack_image
-from pmsmtool.sim.kernel import Application, Simulation
-from pmsmtool.sim.signals import Truth
+from pmsmtool.sim.kernel import Application, Simulation, Truth
 from tests.sim.reference import SCENARIOS, T_S_NS, Scenario, reference_run, relative_error, setup_of, simulate
 
 LINEAR = [scenario for scenario in SCENARIOS if not scenario.saturated]

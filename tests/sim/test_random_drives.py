@@ -18,8 +18,8 @@ from benchmarks.random_drives import (
 from benchmarks.whole_commission import fill_memory
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, parse_machine
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 
 

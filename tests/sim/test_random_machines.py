@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.firmware.image import pack_image
-from pmsmtool.sim.kernel import Part, Setup, Simulation, Target
-from pmsmtool.sim.signals import Truth
+from pmsmtool.sim.kernel import Part, Setup, Simulation, Target, Truth
 from tests.sim.bench import record, values
 
 DRIVES = 80

@@ -16,8 +16,7 @@ from pmsmtool.design.ratings import SAG_SHARE, ratings
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.firmware.core_binding import core
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.papers.governed_drive import IDEAL
 from pmsmtool.sim.closed_loop import image_of
 from tests.firmware.closed_loop import MODE_TORQUE, Loop

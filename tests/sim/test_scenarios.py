@@ -11,9 +11,9 @@ import pytest
 
 from benchmarks.random_drives import draw_drive
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.parameter_set import ParameterSet, default_set
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, TRUE_SIGNALS, drive_values, image_of, simulate
 from pmsmtool.sim.scenarios import BUILT_IN, FILE_EXAMPLE, Scenario, built_in, load_scenario
 from pmsmtool.sim.simulate import find_drive, find_scenario, run_scenario

@@ -15,11 +15,10 @@ from scipy.integrate import solve_ivp
 from benchmarks import second_plant
 from benchmarks.analytic_saturation import BridgeSaturation
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.packaging.compiler import CompilerError
-from pmsmtool.resources import data_folder
-from pmsmtool.sim.kernel import Application, Part, Rotor, Setup, Simulation
-from pmsmtool.sim.signals import Truth
+from pmsmtool.sim.kernel import Application, Part, Rotor, Setup, Simulation, Truth
 from pmsmtool.sim.simulated_machine import build_setup
 from tests.sim.bench import (
     L_D,

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
-from pmsmtool.sim.kernel import Application, Setup, Simulation, Target
-from pmsmtool.sim.signals import Truth
+from pmsmtool.sim.kernel import Application, Setup, Simulation, Target, Truth
 from tests.sim.bench import (
     L_D,
     R_S,

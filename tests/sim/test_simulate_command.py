@@ -10,11 +10,10 @@ import sys
 import numpy as np
 import pytest
 
+from pmsmtool.files import data_folder
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.report.plots import POINTS_MAX, Panel, thinned, trace_figure
-from pmsmtool.resources import data_folder
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import read_trace
+from pmsmtool.trace import Trace, read_trace
 
 pytestmark = pytest.mark.chain
 

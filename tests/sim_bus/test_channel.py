@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.machine.profile import machine_path, profile_names
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
+from pmsmtool.machine.machine_file import machine_path, profile_names
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.channel import DEFAULT_PROFILE, Channel, build_line, parse_channel
 from tests.node.raw_client import RawClient

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from pmsmtool.drive.port import Injection, Shape
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.objects import object_rows
 from tests.node.raw_client import RawClient

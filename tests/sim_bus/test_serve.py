@@ -22,7 +22,7 @@ import canopen
 import pytest
 
 from pmsmtool.errors import BusError
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 from pmsmtool.sim.channel import build_line, parse_channel
 from pmsmtool.sim.serve import HOLD_S, PAUSED, SocketcandServer
 from tests.node.simple_core import SimpleCore

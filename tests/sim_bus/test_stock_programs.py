@@ -12,7 +12,7 @@ import can
 import canopen
 import pytest
 
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.eds import eds_text
 from tests.node.bench import SERIAL, Bench

@@ -10,13 +10,12 @@ import numpy as np
 from pmsmtool.design.tune import tune
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.tracking_model import SIGNALS, Known
+from pmsmtool.files import data_folder
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.resources import data_folder
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
-from pmsmtool.sim.kernel import Part, Simulation, Target
+from pmsmtool.sim.kernel import Part, Simulation, Target, Truth
 from pmsmtool.sim.scenarios import MODES
-from pmsmtool.sim.signals import Truth
 from pmsmtool.sim.simulated_machine import build_setup, device_slope_ohm, settings_of, with_simulation
 from pmsmtool.trace import Trace
 

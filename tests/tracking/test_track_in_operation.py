@@ -19,8 +19,7 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.stop import quick_stop
 from pmsmtool.errors import ExitCode
 from pmsmtool.identification.track import follow, known_of
-from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.profile import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.observe import (
     GIVEN_BACK,
@@ -33,9 +32,9 @@ from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.channel import build_line, parse_channel
 from pmsmtool.sim.drive_kernel import KernelCore
+from pmsmtool.sim.kernel import Truth
 from pmsmtool.sim.node.node import Node
 from pmsmtool.sim.operation import POINT_S, POINTS, START_S, Operation, operate
-from pmsmtool.sim.signals import Truth
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
 from tests.drive.served import serving
 from tests.simulated_bus import settle

@@ -17,6 +17,7 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import ConfigError
+from pmsmtool.files import data_folder
 from pmsmtool.identification.track import (
     dump_known,
     follow,
@@ -29,12 +30,10 @@ from pmsmtool.identification.track import (
 )
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file
 from pmsmtool.measurement.observe import Observations, joined, observe_process_data, observe_recordings
-from pmsmtool.resources import data_folder
 from pmsmtool.run_directory import RunDirectory
-from pmsmtool.sim.signals import Truth
+from pmsmtool.sim.kernel import Truth
 from pmsmtool.sim.simulated_machine import device_slope_ohm, settings_of
-from pmsmtool.trace import Trace
-from pmsmtool.trace_file import trace_npz
+from pmsmtool.trace import Trace, trace_npz
 from tests.drive.bench import SimBench, sim_bench
 from tests.simulated_bus import settle
 

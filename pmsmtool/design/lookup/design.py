@@ -20,8 +20,8 @@ from pmsmtool.design.lookup.grid import (
     stored_axes,
     table_words,
 )
-from pmsmtool.design.lookup.loci import STANDSTILL_V
 from pmsmtool.design.lookup.table import (
+    STANDSTILL_V,
     AxisKind,
     LookupTable,
     TorqueLimits,

@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.design.lookup.grid import InterpolationError, StoredFormat, int16_step_a
-from pmsmtool.design.lookup.loci import Locus
-from pmsmtool.design.lookup.table import AxisKind, LookupTable
+from pmsmtool.design.lookup.table import AxisKind, Locus, LookupTable
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.npz_file import npz_bytes
 from pmsmtool.params.parameter_set import LUT_NAMES, ParameterSet

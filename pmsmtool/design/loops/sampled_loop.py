@@ -78,8 +78,6 @@ class LoopMargins:
         Least distance of L from -1; its inverse is the peak of the sensitivity.
     crossover_rad_s : float
         Gain crossing at which the phase margin is met (rad/s); NaN without a crossing.
-    phase_crossover_rad_s : float
-        Phase crossing at which the gain margin is met (rad/s); NaN without one.
     bandwidth_rad_s : float
         Where |L / (1 + L)| first falls below 1/sqrt(2) (rad/s); Nyquist when it does not.
     delay_s : float
@@ -93,7 +91,6 @@ class LoopMargins:
     delay_margin_s: float
     modulus_margin: float
     crossover_rad_s: float
-    phase_crossover_rad_s: float
     bandwidth_rad_s: float
     delay_s: float
 
@@ -115,8 +112,7 @@ def margins(loop: SampledLoop) -> LoopMargins:
     phase_margins = np.angle(-at_gain)
     worst = int(np.argmin(np.abs(phase_margins))) if phase_margins.size else -1
     lags = np.mod(phase_margins, 2.0 * math.pi)
-    phase_crossings = _phase_crossings(loop)
-    factors = -1.0 / loop.at(phase_crossings).real
+    factors = -1.0 / loop.at(_phase_crossings(loop)).real
     up, down = factors[factors > 1.0], factors[factors < 1.0]
     return LoopMargins(
         stable=bool(np.all(np.abs(loop.closed_loop_poles()) < 1.0)),
@@ -126,7 +122,6 @@ def margins(loop: SampledLoop) -> LoopMargins:
         delay_margin_s=float(np.min(lags / gain_crossings)) if lags.size else math.inf,
         modulus_margin=modulus_margin(loop),
         crossover_rad_s=float(gain_crossings[worst]) if worst >= 0 else math.nan,
-        phase_crossover_rad_s=float(phase_crossings[factors == up.min()][0]) if up.size else math.nan,
         bandwidth_rad_s=_bandwidth(loop),
         delay_s=loop.delay_s,
     )

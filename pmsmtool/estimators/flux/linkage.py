@@ -6,7 +6,7 @@ For a drive that turns its voltage by the delay times the speed, the command is
     v* = j w sinc(w T_s/2) psi(i) + R <i> + v_err,      sinc x = sin x / x,
 
 so u = (v* - v_err - R i) (w T_s/2)/sin(w T_s/2) is j w psi: the correction DIVIDES by sinc. The shaft coasts with
-i_q = 0, where the inverter's error has no q part but the one of the ripple (:mod:`switching_ripple`), and i_d is held
+i_q = 0, where the inverter's error has no q part but the one of the ripple (:mod:`inverter_error`), and i_d is held
 with both signs one after the other: their sum cancels the flux of i_d and what the ripple of the currents does,
 
     (u_q+ + u_q-)/(w+ + w-) = x1 (1 + k2 i_d^2 + k4 i_d^4),      u_d = -L_q w i_q + x2 w - psi w^2 dt + ...,
@@ -37,8 +37,7 @@ from pmsmtool.estimators.flux.linkage_rows import (
     usable,
 )  # fmt: skip
 from pmsmtool.estimators.injection.sampling_instant import CoastingPairs, Sampling, ShownInstant, shown_instant
-from pmsmtool.estimators.injection.switching_ripple import Modulation
-from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.inverter_error import InverterCurve, Modulation
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.injection.sampling_instant import Sampling, course_s2, sampled_ripple
-from pmsmtool.estimators.injection.switching_ripple import Modulation, rippled_error_dq_v
-from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.inverter_error import InverterCurve, Modulation, rippled_error_dq_v
 from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 

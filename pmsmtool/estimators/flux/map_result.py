@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import ConfigError, IdentificationError
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.map_fit import CoenergyFit, MagnetFlux, fit_coenergy
 from pmsmtool.estimators.flux.map_rows import Frame
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.estimators.resistance import ResistanceResult, resistance_warmed
 from pmsmtool.machine.flux_map import FluxMap, require_monotonic
 from pmsmtool.machine.flux_map_check import reciprocal_change

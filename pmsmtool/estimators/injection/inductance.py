@@ -19,15 +19,14 @@ import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.estimate import CHI2_REFUSE, SensorTolerance, Verdict, chi2_gate, condition_gate
 from pmsmtool.estimators.injection.angle_dependence import UNSEEN_RANGE, AngleDependence, over_angle
 from pmsmtool.estimators.injection.axis_fit import MOST_R, AxisFit, fit_axis
 from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES, Shot, VoltageError, projected, with_line
 from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstant
-from pmsmtool.estimators.injection.switching_ripple import LEG_ANGLES
-from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.estimators.noise import Noise
+from pmsmtool.estimators.inverter_error import LEG_ANGLES, InverterCurve
 from pmsmtool.estimators.shaft.position import position_noise
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.refusals import refuse

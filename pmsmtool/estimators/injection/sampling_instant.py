@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
-from pmsmtool.estimators.injection.switching_ripple import LEG_ANGLES, Modulation, duties, phases_of
+from pmsmtool.estimators.inverter_error import LEG_ANGLES, Modulation, duties, phases_of
 
 ANGLES = 12
 """Angles over which the ripple is averaged: a sixth of a turn, after which three equal phases repeat."""

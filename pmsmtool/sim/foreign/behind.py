@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from pmsmtool.cia402 import Mode
+from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.dictionary import Dictionary, Entry
 from pmsmtool.sim.node.power_drive import Plant, PowerDrive
-from pmsmtool.sim.signals import Signal
 
 if TYPE_CHECKING:
     from pmsmtool.machine.machine_file import MachineFile

@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from pmsmtool.sim.foreign.behind import Behind, SetUp
+from pmsmtool.sim.foreign.families import Law
 from pmsmtool.sim.foreign.file_rows import MakersObjects
-from pmsmtool.sim.foreign.laws import Law
 
 Form = Literal["parallel", "rate", "time"]
 Address = tuple[int, int]

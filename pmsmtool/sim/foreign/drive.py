@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """A simulated drive with the object dictionary of a maker's file, over plant and CANopen server of ``sim/node``.
 
-Objects that the file lacks do not exist. Objects with a law (``families``, ``laws``) show and command the simulated
+Objects that the file lacks do not exist. Objects with a law (``families``) show and command the simulated
 machine in the maker's units; all others keep what is written within the file's limits. The motor is entered as the
 maker's set-up tool would have done it; everything else holds what the file says.
 """
@@ -19,9 +19,8 @@ from pmsmtool.bus.clock import Schedule, Timer
 from pmsmtool.errors import ConfigError
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
-from pmsmtool.sim.foreign.families import assumed_modes, family_of, laws_of, modes_of, units_of
+from pmsmtool.sim.foreign.families import Law, assumed_modes, family_of, laws_of, modes_of, units_of
 from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects, read_makers_objects
-from pmsmtool.sim.foreign.laws import Law
 from pmsmtool.sim.foreign.position import PositionLoop
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH

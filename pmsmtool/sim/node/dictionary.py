@@ -1,15 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""The object dictionary at run time: typed entries with range checks, and hooks of the application behind them."""
+"""The object dictionary at run time: typed entries with range checks, and hooks of the application behind them.
+
+:class:`Face` is what a simulated drive needs of a dictionary that it shows instead of its own.
+"""
 
 from __future__ import annotations
 
 import math
 import struct
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Protocol
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.errors import ConfigError
 from pmsmtool.sim.node.objects import ObjectRow, object_rows
+
+if TYPE_CHECKING:
+    from pmsmtool.bus.clock import Schedule
+    from pmsmtool.sim.node.power_drive import Plant, PowerDrive
+    from pmsmtool.sim.node.session import Session
 
 Sink = Callable[[bytes], bool | None]
 """Takes the bytes of a write; returns True when the write is confirmed later (slow store)."""
@@ -200,3 +209,31 @@ class Dictionary:
         if changed and entry.row.stored:
             self.on_change(entry)
         return pending
+
+
+class Guarding(Protocol):
+    """Node guarding (objects 0x100C, 0x100D)."""
+
+    def asked(self) -> None:
+        """Take a remote frame."""
+
+
+class DriveFace(Protocol):
+    """Another dictionary over the same application."""
+
+    @property
+    def vendor_product(self) -> tuple[int, int]:
+        """Vendor and product that 0x1018 shows."""
+
+    @property
+    def label(self) -> str:
+        """Beginning of the device name."""
+
+    def dress(self, dictionary: Dictionary) -> None:
+        """Change a dictionary whose application is not hooked up yet."""
+
+    def attach(self, dictionary: Dictionary, plant: Plant, power: PowerDrive, schedule: Schedule) -> None:
+        """Put own functions over the running application."""
+
+    def guarding(self, session: Session) -> Guarding | None:
+        """Return node guarding where the drive has it."""

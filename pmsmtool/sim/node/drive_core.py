@@ -15,7 +15,7 @@ from enum import IntEnum, IntFlag
 from typing import Protocol
 
 from pmsmtool.drive.port import Excitation
-from pmsmtool.sim.signals import Signal
+from pmsmtool.sim.kernel import Signal
 
 TRACE_BYTES = 65536
 """Capacity of the recorder (bytes)."""

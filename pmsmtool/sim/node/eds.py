@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map
-from pmsmtool.resources import data_folder
+from pmsmtool.files import data_folder
 from pmsmtool.sim.node.objects import ObjectRow, object_rows
 
 FILE_NAME = "pmsmsim.eds"

@@ -11,10 +11,10 @@ import math
 from typing import TYPE_CHECKING
 
 from pmsmtool.params.catalogue import BY_NAME
-from pmsmtool.sim.node.face import DriveFace
-from pmsmtool.sim.node.family_position import calm_gains
+from pmsmtool.sim.node.dictionary import DriveFace
 from pmsmtool.sim.node.node import Settings
 from pmsmtool.sim.node.parameter_set import ParameterImage
+from pmsmtool.sim.node.position_modes import calm_gains
 from pmsmtool.sim.simulated_machine import settings_of
 
 if TYPE_CHECKING:

@@ -22,10 +22,10 @@ from pmsmtool.drive_maps.wire_units import WireUnit, wire_unit
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, TORQUE_PER_AMPERE
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
-from pmsmtool.sim.node.family_position import INCREMENTS, PID, PROFILE, SPEED, PositionSide, pid_of
 from pmsmtool.sim.node.makers_recorders import Monitor, Rings, TraceRows
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.own_measurements import OsCommands
+from pmsmtool.sim.node.position_modes import INCREMENTS, PID, PROFILE, SPEED, PositionSide, pid_of
 from pmsmtool.sim.node.power_drive import Plant, PowerDrive
 from pmsmtool.units import RAD_S_PER_MRPM
 

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.cia402 import EXCITATION_ABORTED, Mode, State
 from pmsmtool.drive.port import Excitation, Injection, Shape
+from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.drive_core import (
     BUFFER_SAMPLES,
@@ -28,7 +29,6 @@ from pmsmtool.sim.node.drive_core import (
     Trigger,
 )
 from pmsmtool.sim.node.power_drive import Plant, PowerDrive
-from pmsmtool.sim.signals import Signal
 
 LIVE_SIGNALS: dict[str, Signal] = {
     "i_d_a": Signal.I_D,

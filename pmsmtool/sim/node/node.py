@@ -10,14 +10,13 @@ from typing import Protocol
 
 from pmsmtool.bus.clock import Schedule, VirtualClock
 from pmsmtool.sim.faults import Absence
-from pmsmtool.sim.node import store as storing
+from pmsmtool.sim.node import memory as storing
+from pmsmtool.sim.node.dictionary import DriveFace
 from pmsmtool.sim.node.drive_core import DriveCore
-from pmsmtool.sim.node.face import DriveFace
 from pmsmtool.sim.node.lss import UNCONFIGURED
-from pmsmtool.sim.node.memory import Memory
+from pmsmtool.sim.node.memory import Memory, Store
 from pmsmtool.sim.node.parameter_set import ParameterImage
 from pmsmtool.sim.node.session import Session
-from pmsmtool.sim.node.store import Store
 
 VENDOR = 0x706D736D
 PRODUCT = 0x00000001

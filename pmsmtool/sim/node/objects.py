@@ -19,8 +19,8 @@ from functools import cache
 from pathlib import Path
 
 from pmsmtool.data_types import BY_SHORT, SHORT, DataType
+from pmsmtool.files import data_folder
 from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, Parameter, layout_signature
-from pmsmtool.resources import data_folder
 
 _COUNTED = {"ARRAY8": "ARRAY", "RECORD8": "RECORD"}
 

@@ -29,11 +29,11 @@ from pmsmtool.drive_maps.vendor_tuning import (
     VendorTuning,
 )
 from pmsmtool.errors import ConfigError
+from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.drive_core import Averages, AverageState, Command, ControlMode
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.power_drive import Plant, PowerDrive
-from pmsmtool.sim.signals import Signal
 from pmsmtool.units import rad_s_from_rpm
 
 Measured = Generator[float, None, float]

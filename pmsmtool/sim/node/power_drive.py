@@ -14,13 +14,13 @@ from typing import Protocol
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import Schedule, Timer
 from pmsmtool.cia402 import AbortConnection, Control, FaultReaction, Mode, QuickStop, State, Status
+from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore
 from pmsmtool.sim.node.emergency import Emergency
 from pmsmtool.sim.node.position_modes import FOLLOWING_ERROR, PositionModes
 from pmsmtool.sim.node.position_modes import MODES as _POSITION_MODES
 from pmsmtool.sim.node.quick_stop import Stopping
-from pmsmtool.sim.signals import Signal
 from pmsmtool.units import RAD_S_PER_MRPM
 
 HEARTBEAT_LOST, PDO_MISSED = 0x8130, 0x8250

@@ -13,9 +13,9 @@ from collections.abc import Callable
 
 from pmsmtool.bus.clock import NS, Schedule, Timer
 from pmsmtool.cia402 import QuickStop
+from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.dictionary import Dictionary
 from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore
-from pmsmtool.sim.signals import Signal
 from pmsmtool.units import RAD_S_PER_RPM
 
 CURRENT_GONE_SHARE = 0.02

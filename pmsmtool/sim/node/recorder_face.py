@@ -12,11 +12,11 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.drive_maps.recorder_map import Address
 from pmsmtool.drive_maps.wire_units import wire_unit
+from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.drive_core import RecorderSetup, RecorderState
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.power_drive import Plant
-from pmsmtool.sim.signals import Signal
 
 SIGNALS = {
     "position_rad": Signal.THETA_M,

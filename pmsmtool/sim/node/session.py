@@ -10,19 +10,18 @@ from typing import Protocol
 from pmsmtool.bus.clock import Schedule
 from pmsmtool.cia402 import State
 from pmsmtool.firmware.image import crc32
-from pmsmtool.sim.node import store as storing
-from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+from pmsmtool.sim.node import memory as storing
+from pmsmtool.sim.node.dictionary import Dictionary, DriveFace, Entry, Refused
 from pmsmtool.sim.node.eds import eds_text
 from pmsmtool.sim.node.emergency import Emergency
-from pmsmtool.sim.node.face import DriveFace
 from pmsmtool.sim.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from pmsmtool.sim.node.lss import ANSWER_ID, REQUEST_ID, LssSlave
 from pmsmtool.sim.node.measurement import Measurement
+from pmsmtool.sim.node.memory import Group, Store, Stored
 from pmsmtool.sim.node.parameter_set import ParameterImage, ParameterSet
 from pmsmtool.sim.node.pdo import ProcessData
 from pmsmtool.sim.node.power_drive import PDO_MISSED, Plant, PowerDrive
 from pmsmtool.sim.node.sdo_server import SdoServer
-from pmsmtool.sim.node.store import Group, Store, Stored
 
 SET_LOST = 0x6310
 MEMORY_DAMAGED = 0x5530

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Gains of the three phase current sensors over their mean, from pairs of phases, and traces without their mismatch.
+"""The current sensors: noise and offset at zero current, gains of the phases over their mean, traces without these.
 
 The currents of a machine add up to nothing, those of sensors with the gains 1 + g_x (sum of the g_x zero) do not:
 
@@ -8,6 +8,8 @@ The currents of a machine add up to nothing, those of sensors with the gains 1 +
 Three pairs give three equations of rank two; the mean gain stays a tolerance. The drive takes the Clarke transform of
 what it measures: along a fixed vector the mismatch is a gain and a cross term, over whole turns of a frame that follows
 the rotor it averages out.
+
+Every gate of identification compares a residual with the noise at zero current, never with the scatter of its own fit.
 """
 
 from __future__ import annotations
@@ -19,9 +21,64 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.noise import Noise
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
+
+MINIMUM_SAMPLES = 256
+"""Samples below which the noise is not known to 5 % (relative error 1/sqrt(2 n))."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """White noise of one axis current.
+
+    Attributes
+    ----------
+    sigma_a : float
+        Standard deviation of one sample of i_d or i_q (A).
+    offset_d_a, offset_q_a : float
+        Mean of the zero-current trace (A).
+    """
+
+    sigma_a: float
+    offset_d_a: float
+    offset_q_a: float
+
+
+def estimate_noise(trace: Trace) -> Noise:
+    """Pooled standard deviation of both axis currents about a straight line.
+
+    Raises IdentificationError: ``E_EXCITATION`` for too few samples, ``E_SNR`` when the trace is constant: the
+    quantiser hides the noise, and averaging cannot resolve less than one step.
+
+    Parameters
+    ----------
+    trace : Trace
+        ``i_d_a`` and ``i_q_a`` at zero current in a fixed frame.
+    """
+    n = len(trace)
+    if n < MINIMUM_SAMPLES:
+        raise refuse("E_EXCITATION", f"{n} samples at zero current, {MINIMUM_SAMPLES} needed", stage="noise")
+    basis = np.stack([np.ones(n), np.linspace(-1.0, 1.0, n)], axis=1)
+    power, means = 0.0, []
+    for name in ("i_d_a", "i_q_a"):
+        current = trace[name]
+        coefficients, *_ = np.linalg.lstsq(basis, current, rcond=None)
+        residual = current - basis @ coefficients
+        power += float(residual @ residual)
+        means.append(float(np.mean(current)))
+    sigma = math.sqrt(power / (2 * (n - 2)))
+    if all(float(np.ptp(trace[name])) == 0.0 for name in ("i_d_a", "i_q_a")):
+        raise refuse(
+            "E_SNR",
+            f"{n} samples at zero current are all equal: the noise is below the converter's step",
+            stage="noise",
+            likely="a converter coarser than its noise, or a current measurement that is switched off",
+            hint="check that the current measurement works, and the range of its converter",
+        )
+    return Noise(sigma, means[0], means[1])
+
 
 MEAN_SAMPLES = 512
 """Samples of a mean of a pair."""
