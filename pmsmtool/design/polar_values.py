@@ -4,12 +4,11 @@
 The times are those of Miyajima et al. 2013 and of the laws built on it, in control periods: they were found at 0.1 ms.
 Section IV.A there: the inputs (V_a, delta) span the current plane wherever V_a is not zero. Here with numbers, over
 speed and torque: how well they span it, what the two single-loop designs make of the coupled machine, how far gains go.
-The option bits are those of ``firmware/core/polar.c``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,31 +28,12 @@ from pmsmtool.design.polar import (
     largest_i_q,
     linearised,
 )
+from pmsmtool.design.polar_laws import LAWS, LINEAR_RANGE, ON_MEASUREMENT, PHASE_LAWS, PREDICT, SURFACE_ONLY
 from pmsmtool.design.ratings import Ratings
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import RAD_S_PER_RPM, RPM_PER_RAD_S
-
-LAWS: Mapping[str, int] = {
-    "conventional": 1,
-    "proposed": 2,
-    "linear": 3,
-    "linear-printed": 4,
-    "regularised": 5,
-    "unified": 6,
-}
-"""``polar.mode`` of the catalogue."""
-
-SURFACE_ONLY = ("conventional", "proposed", "linear", "linear-printed")
-"""Laws of the paper: they hold for L_d = L_q."""
-
-ON_MEASUREMENT, NO_ANTI_WINDUP, PREDICT, LINEAR_RANGE = 1, 2, 4, 8
-"""Bits of ``polar.options``: P and D on the measurement, (ablation), prediction, switch to the regularised law."""
-
-PHASE_LAWS = ("conventional", "proposed")
-"""Laws of section III: the phase is the input for i_q, which needs speed."""
-
 
 TAU_PERIODS = 10.0
 """Equivalent time constant of the coefficient diagram method, in control periods."""

@@ -11,7 +11,7 @@ from typing import Any, get_args
 from pmsmtool.design.design_file import Scalar
 from pmsmtool.design.loops.current_loop import Method
 from pmsmtool.design.loops.speed_loop import SpeedMethod
-from pmsmtool.design.polar_values import LAWS as POLAR_LAWS
+from pmsmtool.design.polar_laws import LAWS as POLAR_LAWS
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.key import Key, KeyKind, check_table, not_numbers
 from pmsmtool.machine.uncontrolled_generation import Protection

@@ -338,13 +338,13 @@ def test_command_exit_codes(tmp_path: Path) -> None:
 
 def test_choices_of_the_command_are_those_of_the_design() -> None:
     from pmsmtool.cli.tune import tune_command
-    from pmsmtool.design.polar_values import LAWS
+    from pmsmtool.design import polar_laws
     from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES, GOVERNOR_MODES
 
     choices = {p.name: tuple(p.type.choices) for p in tune_command.params if hasattr(p.type, "choices")}
     assert choices["governor"] == tuple(GOVERNOR_MODES)
     assert choices["field_weakening"] == ("auto", *FIELD_WEAKENING_MODES)
-    assert choices["polar_law"] == tuple(LAWS)
+    assert choices["polar_law"] == tuple(polar_laws.LAWS)
     for name, options in choices.items():
         for option in options:
             assert TuneRequest(**{name: option}).table()[name] == option

@@ -115,7 +115,7 @@ def test_a_window_belongs_to_one_pair() -> None:
 def _checked(**signals: Array) -> str:
     whole = _changed(_windows(), **signals)
     left, told = usable(whole)
-    check_speeds(whole, pairs_of(left), left["omega_e_rad_s"])
+    check_speeds(left, pairs_of(left), whole)
     return told
 
 

@@ -174,9 +174,10 @@ def estimate_flux_linkage(
         Reference temperature (degC) and coefficient of the magnets (1/K).
     """
     tolerance = tolerance or SensorTolerance()
-    whole, (speeds, left_out) = speeds, usable(speeds)
+    whole = speeds
+    speeds, left_out = usable(whole)
     pairs = pairs_of(speeds)
-    check_speeds(whole, pairs, speeds["omega_e_rad_s"])
+    check_speeds(speeds, pairs, whole)
     rows = corrected(speeds, R_ohm, period_s, inverter, modulation, lag_s, sampling)
     d_fit, d_std, d_dof = _fit_d(rows)
     even = _fit_even(rows, pairs)

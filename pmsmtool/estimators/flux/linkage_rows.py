@@ -194,11 +194,12 @@ def usable(speeds: Trace) -> tuple[Trace, str]:
     return replace(speeds, t_s=speeds.t_s[~left_out], signals=kept), told
 
 
-def check_speeds(whole: Trace, pairs: Sequence[tuple[int, int]], w: Array) -> None:
-    """Refuse a run that has too few speeds ``w`` in usable pairs of windows, by what the ``whole`` run shows.
+def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]], whole: Trace) -> None:
+    """Refuse a run whose usable windows have too few pairs or speeds, by what the ``whole`` run shows.
 
     Raises IdentificationError: ``E_EXCITATION``, ``E_CLIPPED``, ``E_NOT_SETTLED``.
     """
+    w = speeds["omega_e_rad_s"]
     for sign, name in ((1.0, "forward"), (-1.0, "backward")):
         mine = np.array([abs(w[k]) for k, _ in pairs if np.sign(w[k]) == sign])
         if len(mine) >= MINIMUM_PAIRS and float(np.max(mine)) >= SPEED_RATIO * float(np.min(mine)):
