@@ -57,8 +57,11 @@ class Peer:
     def number(self, index: int, sub: int = 0) -> int:
         return int.from_bytes(self.sdo.read(index, sub), "little")
 
-    def ask(self, frame: bytes, timeout_s: float = 0.3) -> bytes | None:
-        """Send a raw request and return the next raw answer."""
+    def ask(self, frame: bytes, timeout_s: float = 0.9) -> bytes | None:
+        """Send a raw request and return the next raw answer.
+
+        The wait is shorter than the second after which a slave aborts what was left open.
+        """
         self.answers.clear()
         self.connection.send(0x600 + NODE, frame.ljust(8, b"\0"))
         return self.answers.get(timeout_s)
@@ -287,7 +290,7 @@ class NodeContract:
 
     def test_silent_while_stopped(self, peer: Peer) -> None:
         send_nmt(peer.connection, NmtCommand.STOP, NODE)
-        assert peer.ask(HEAD.pack(0x40, 0x1018, 1)) is None
+        assert peer.ask(HEAD.pack(0x40, 0x1018, 1), timeout_s=0.3) is None
         send_nmt(peer.connection, NmtCommand.PRE_OPERATIONAL, NODE)
         assert peer.ask(HEAD.pack(0x40, 0x1018, 1)) is not None
 
