@@ -52,6 +52,14 @@ def read_toml(path: Path, *, hint: str = "check the path") -> dict[str, Any]:
     return parse_toml(read_text(path, hint=hint), where=str(path))
 
 
+def refuse_schema(found: object, *known: str, where: str, likely: str = "", hint: str = "") -> None:
+    """Refuse a file of another schema than those that are known; raises ``ConfigError``."""
+    if found not in known:
+        said = "has no schema" if found is None else f"schema is {found!r}"
+        what = f"{said}, expected {' or '.join(map(repr, known))}"
+        raise ConfigError(what, where=where, likely=likely, hint=hint)
+
+
 def written_value(text: str) -> Any:
     """Return the value of ``KEY=VALUE`` as TOML reads it; what is no TOML is text."""
     try:

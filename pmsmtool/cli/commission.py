@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import FOLDER, REHEARSED, map_option, new_run, read_map, rehearsal_bus, runs_option
+from pmsmtool.cli.drive_access import REHEARSED, map_option, new_run, read_map, rehearsal_bus, runs_option
 from pmsmtool.cli.options import (
+    DIR,
     FILE,
     HZ,
     BusOptions,
@@ -51,7 +52,7 @@ LIMITS = ("current", "speed")
     ),
 )
 @click.argument("machine", required=False, type=FILE)
-@click.option("--resume", type=FOLDER, metavar="RUN_DIR", help="Go on with a run where it ended, with its motor file "
+@click.option("--resume", type=DIR, metavar="RUN_DIR", help="Go on with a run where it ended, with its motor file "
               "and its limits; options of the design are given again.")  # fmt: skip
 @click.option("--rehearse", is_flag=False, flag_value="", metavar="FAMILY", help="Rehearse: MACHINE, simulated, behind "
               "the map of a drive family, or with --eds alone.")  # fmt: skip

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.options import FILE, Quantity, examples, output_options
+from pmsmtool.cli.options import ANY_PATH, FILE, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, figure_format, save_figure, table
 
 
@@ -18,8 +18,8 @@ from pmsmtool.cli.output import Output, figure_format, save_figure, table
         "pmsmtool diff BEFORE AFTER --check && echo nothing changed",
     ),
 )
-@click.argument("first", type=click.Path(path_type=Path))
-@click.argument("second", type=click.Path(path_type=Path))
+@click.argument("first", type=ANY_PATH)
+@click.argument("second", type=ANY_PATH)
 @click.option("--check", is_flag=True, help="Exit code 1 where a value differs beyond its interval, or one is missing.")
 @click.option("--tol", type=Quantity("ratio"), help="Limit in place of the intervals, e.g. 2%; of parameters, too.")
 @click.option("--plot", "plot_path", type=FILE, help="Differences over their intervals to write (.svg, .png, .pdf).")

@@ -14,7 +14,7 @@ from urllib.parse import quote
 
 import click
 
-from pmsmtool.cli.options import FILE, SIMULATED_INTERFACE, BusOptions
+from pmsmtool.cli.options import DIR, FILE, SIMULATED_INTERFACE, BusOptions
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import BusError, ConfigError
 from pmsmtool.files import read_text, refuse_existing
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.run_directory import RunDirectory
 
-FOLDER = click.Path(file_okay=False, path_type=Path)
 FORCE = "pmsmtool.force"
 LOOKING_S = 30.0
 """Time for the transfers of a command that reads a few objects; a drive that answers needs a second."""
@@ -48,7 +47,7 @@ def map_option(function: Callable[..., Any]) -> Callable[..., Any]:
 def runs_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add ``--runs`` to a command, which receives ``runs: Path``."""
     text = "Where run directories are made."
-    return click.option("--runs", type=FOLDER, default=Path("runs"), metavar="DIR", help=text)(function)
+    return click.option("--runs", type=DIR, default=Path("runs"), metavar="DIR", help=text)(function)
 
 
 def new_file(*names: str, **attributes: Any) -> Callable[..., Any]:

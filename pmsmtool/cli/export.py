@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.drive_access import map_option, read_map
-from pmsmtool.cli.options import FILE, NODE, examples, text_options
+from pmsmtool.cli.options import ANY_PATH, DIR, FILE, NODE, examples, text_options
 from pmsmtool.cli.output import Output
 from pmsmtool.files import read_bytes, refuse_source, write_file
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.params.parameter_set import ParameterSet
 
-_SOURCE = click.argument("design", type=click.Path(path_type=Path))
+_SOURCE = click.argument("design", type=ANY_PATH)
 _OUTPUT = click.option("-o", "--output", "path", type=FILE, help="File to write.  [default: standard output]")
 _PREFIX = click.option("--prefix", default="pmsm", help="C identifier in front of every name.")
 SHOWN = 5
@@ -163,7 +163,7 @@ def header_command(design: Path, prefix: str, out: Output) -> str:
     "-o",
     "--output",
     "folder",
-    type=click.Path(file_okay=False, path_type=Path),
+    type=DIR,
     required=True,
     help="Folder to write into; made when it is not there.",
 )

@@ -13,6 +13,8 @@ import click
 
 from pmsmtool.cli.drive_access import OWN_FAMILY, WHOLE_SET_S, map_of_drive, map_option, open_node, read_map
 from pmsmtool.cli.options import (
+    ANY_PATH,
+    DIR,
     FILE,
     NODE,
     BusOptions,
@@ -242,13 +244,13 @@ def _prefixed(out: Output, node_id: int) -> Any:
         "pmsmtool -i socketcan -c can0 flash-params RUN_DIR --nodes 2-6 --yes --serials serials.txt",
     ),
 )
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("source", type=ANY_PATH)
 @click.option("--dry-run", is_flag=True, help="Show what would change and stop.")
 @click.option("--check", is_flag=True, help="As --dry-run; exit code 1 when something would change.")
 @click.option("--nodes", type=NodeList(), metavar="LIST", help="Several drives of the bus, e.g. 1-3,7.")
 @click.option("--serials", type=FILE, help="With --nodes and --yes, without a prompt: a file with a line NODE "
               "SERIAL per drive.")  # fmt: skip
-@click.option("--canary", type=click.Path(file_okay=False, path_type=Path), metavar="RUN_DIR", help="Run of a drive "
+@click.option("--canary", type=DIR, metavar="RUN_DIR", help="Run of a drive "
               "of this kind that passed `prove` with this set; needed by --serials.  [default: SOURCE]")  # fmt: skip
 @click.option("--no-store", is_flag=True, help="Let it act until the next reset only.")
 @map_option

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.options import FILE, examples, output_options
+from pmsmtool.cli.options import DIR, FILE, examples, output_options
 from pmsmtool.cli.output import Output, table
 from pmsmtool.files import write_file
 
@@ -37,7 +37,7 @@ LEAST_DRAWN = 3
         "pmsmtool fleet runs --json | jq '.motors[].quantities[].odd'",
     ),
 )
-@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("folder", type=DIR)
 @click.option("-o", "--output", "path", type=FILE, help="Write a page (.html), or every value of every run (.csv).")
 @output_options
 def fleet_command(folder: Path, path: Path | None, out: Output) -> None:

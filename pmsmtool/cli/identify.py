@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import FOLDER, map_option, runs_option
-from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
+from pmsmtool.cli.drive_access import map_option, runs_option
+from pmsmtool.cli.options import DIR, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
     default="auto",
     help="How; auto: the best that this drive allows (`pmsmtool caps`).",
 )
-@click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="Recompute from the traces of a run; moves nothing.")
-@click.option("--fingerprint", type=FOLDER, metavar="RUN", help="Measure R, L, psi, encoder and pole pairs again, in "
+@click.option("--replay", type=DIR, metavar="RUN_DIR", help="Recompute from the traces of a run; moves nothing.")
+@click.option("--fingerprint", type=DIR, metavar="RUN", help="Measure R, L, psi, encoder and pole pairs again, in "
               "short, and compare them with those of a run: exit code 1 where one differs.")  # fmt: skip
 @runs_option
 @click.option(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.options import FILE, Quantity, examples, output_options
+from pmsmtool.cli.options import ANY_PATH, FILE, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, figure_format, inside, save_figure, table
 from pmsmtool.errors import BusError, NotAvailable
 
@@ -40,7 +40,7 @@ IN_PROCESS = 20_000
         "pmsmtool margins design.toml --u-dc 480V 560V --magnet -20degC 110degC --voltage-headroom 0",
     ),
 )
-@click.argument("design", type=click.Path(path_type=Path))
+@click.argument("design", type=ANY_PATH)
 @click.option("--monte-carlo", "samples", type=click.IntRange(0, 10**8), default=0, metavar="N", help="Random samples.")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the random samples.")
 @click.option(

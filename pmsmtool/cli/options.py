@@ -95,20 +95,25 @@ class Quantity(click.ParamType[float]):
         return found
 
 
+_EMPTY = "the text is empty, as a shell leaves a variable that is not set"
+
+
 class FilePath(click.Path):
     """A path, as ``pathlib.Path``; that module is imported when a path is given, not with this one.
 
     A name that ends as another kind of file than ``ending`` is refused.
     """
 
-    def __init__(self, ending: str = "", *, dir_okay: bool = True) -> None:
-        super().__init__(dir_okay=dir_okay)
+    def __init__(self, ending: str = "", *, file_okay: bool = True, dir_okay: bool = True) -> None:
+        super().__init__(file_okay=file_okay, dir_okay=dir_okay)
         self.ending = ending
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path, or fail as a usage error."""
         from pathlib import Path
 
+        if not value:  # else it is the current folder
+            self.fail(_EMPTY, param, ctx)
         if value == "-":  # else a file of that name is made, which few shells remove
             self.fail("'-' is not the name of a file; where the system has /dev/stdout, give that", param, ctx)
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
@@ -121,6 +126,7 @@ NODE = WholeNumber("node", 1, 127)
 BITRATE = WholeNumber("bit rate", 1, 10**7)
 HZ, DEG, DB = (Quantity(unit, bare=True) for unit in ("Hz", "deg", "dB"))
 FILE, TOML, NPZ = (FilePath(ending, dir_okay=False) for ending in ("", ".toml", ".npz"))
+DIR, ANY_PATH = FilePath(file_okay=False), FilePath()
 SERIAL = WholeNumber("serial", 0, 0xFFFFFFFF_FFFFFFFF)
 CURRENT = Quantity("current")
 SPEED = Quantity("angular speed")
@@ -353,8 +359,10 @@ def bus_options(function: Function) -> Function:
 
 
 def _output(ctx: click.Context, verbose: int, quiet: bool, json_output: bool) -> Output:
-    for param in ctx.command.params:
-        value = ctx.params.get(param.name or "")
+    for where, param in ((c, p) for c in (ctx.find_root(), ctx) for p in c.command.params):
+        value = where.params.get(param.name or "")
+        if value == "" and getattr(param, "flag_value", None) != "":
+            raise click.BadParameter(_EMPTY, where, param)
         if isinstance(value, float) and not math.isfinite(value):  # a range of numbers lets NaN pass
             raise click.BadParameter(f"{value} is not finite", ctx, param)
     above = ctx.find_root().params if ctx.parent else {}

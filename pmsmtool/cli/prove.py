@@ -11,6 +11,7 @@ import click
 
 from pmsmtool.cli.drive_access import map_option, new_run, open_drive, read_map, runs_option
 from pmsmtool.cli.options import (
+    ANY_PATH,
     BusOptions,
     MotionOptions,
     bus_options,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
         "pmsmtool prove -i socketcan -c can0 -n 5 design.toml --i-max 12Apk --speed-max 3000rpm --shaft free",
     ),
 )
-@click.argument("design", type=click.Path(path_type=Path))
+@click.argument("design", type=ANY_PATH)
 @runs_option
 @click.option("--machines", type=click.IntRange(32, 2000), default=96, help="Machines drawn for the prediction.")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the draw.")

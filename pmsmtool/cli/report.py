@@ -12,7 +12,7 @@ from pathlib import Path
 
 import click
 
-from pmsmtool.cli.options import DURATION, FILE, WholeNumber, examples, output_options
+from pmsmtool.cli.options import ANY_PATH, DURATION, FILE, WholeNumber, examples, output_options
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import write_file
@@ -35,7 +35,7 @@ news.addEventListener("end", () => news.close());</script>"""
         "pmsmtool report --anonymous runs/20260101T120000Z-000055f1 -o to-send.json",
     ),
 )
-@click.argument("run", type=click.Path(path_type=Path))
+@click.argument("run", type=ANY_PATH)
 @click.option("-o", "--output", "path", type=FILE, help="Page to write.  [default: report.html in the run directory]")
 @click.option("--anonymous", is_flag=True, help="Instead of the page one JSON file to send: traces, objects, verdicts, "
               "no names.  [default: anonymous.json in the run directory]")  # fmt: skip

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.options import FILE, FilePath, WholeNumber, examples, output_options
+from pmsmtool.cli.options import ANY_PATH, FILE, WholeNumber, examples, output_options
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ _SUFFIXES = (".json", ".csv", ".txt")
 )
 @click.argument("figure", metavar="FIGURE|all", required=False)
 @click.option(
-    "-o", "--output", "path", type=FilePath(), metavar="DIR|FILE", help="Folder, or one file (.json, .csv, .txt)."
+    "-o", "--output", "path", type=ANY_PATH, metavar="DIR|FILE", help="Folder, or one file (.json, .csv, .txt)."
 )
 @click.option("--plot", "figure_path", type=FILE, help="Figure to write (.svg, .png, .pdf).")
 @click.option("--seed", type=_SEED, default=1, show_default=True, help="Seed of random cases and of noise.")

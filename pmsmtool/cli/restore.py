@@ -9,8 +9,8 @@ import click
 
 from pmsmtool.cli.drive_access import WHOLE_SET_S, map_option, open_node, read_map
 from pmsmtool.cli.options import (
+    ANY_PATH,
     BusOptions,
-    FilePath,
     MotionOptions,
     bus_options,
     examples,
@@ -28,7 +28,7 @@ from pmsmtool.cli.output import Output
         "pmsmtool -n 6 restore drive.json --other-drive --dry-run",
     ),
 )
-@click.argument("snapshot_file", metavar="[FILE]", type=FilePath(), required=False)
+@click.argument("snapshot_file", metavar="[FILE]", type=ANY_PATH, required=False)
 @click.option("--other-drive", is_flag=True, help="The backup is of another drive of this kind (a spare part).")
 @click.option("--dry-run", is_flag=True, help="Show what would change and stop.")
 @map_option

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import FOLDER, map_option, new_run, open_drive, read_map, runs_option
-from pmsmtool.cli.options import FREQUENCY, TIME, BusOptions, bus_options, examples, output_options
+from pmsmtool.cli.drive_access import map_option, new_run, open_drive, read_map, runs_option
+from pmsmtool.cli.options import ANY_PATH, DIR, FREQUENCY, TIME, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
 if TYPE_CHECKING:
@@ -38,12 +38,12 @@ QUANTITIES = {"R": "R_s_ohm", "psi": "psi_f_wb"}
     ),
 )
 @click.argument("quantities", nargs=-1, metavar="[R|psi]...", type=click.Choice(list(QUANTITIES)))
-@click.option("--machine", type=click.Path(exists=True, path_type=Path), help="Machine file, design or run directory; "
+@click.option("--machine", type=ANY_PATH, help="Machine file, design or run directory; "
               "default: what the drive holds.")  # fmt: skip
 @click.option("--for", "seconds", type=TIME, default="10s", help="How long.")
 @click.option("--by", type=click.Choice(["pdo", "trace"]), default="pdo", help="Process data, or recordings.")
 @click.option("--rate", "rate_hz", type=FREQUENCY, default="100Hz", help="Process data per second.")
-@click.option("--replay", type=FOLDER, metavar="RUN_DIR", help="From what an earlier track kept; asks no drive.")
+@click.option("--replay", type=DIR, metavar="RUN_DIR", help="From what an earlier track kept; asks no drive.")
 @runs_option
 @map_option
 @bus_options

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from pmsmtool.cli.drive_access import OWN_FAMILY, WHOLE_SET_S, map_of_drive, map_option, open_node
-from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
+from pmsmtool.cli.options import ANY_PATH, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 
 
@@ -20,7 +20,7 @@ from pmsmtool.cli.output import Output
         "pmsmtool -n 5 verify drive.json       # a backup",
     ),
 )
-@click.argument("source", type=click.Path(path_type=Path))
+@click.argument("source", type=ANY_PATH)
 @click.option("--other-drive", is_flag=True, help="The backup is of another drive of this kind (a spare part).")
 @map_option
 @bus_options

@@ -20,7 +20,7 @@ from pmsmtool.machine.machine_file import SCHEMA as MACHINE_SCHEMA
 from pmsmtool.machine.machine_file import profile_names
 from pmsmtool.params import parameter_set
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
-from pmsmtool.toml_file import parse_toml
+from pmsmtool.toml_file import parse_toml, refuse_schema
 
 NEXT_STEP = "give a parameter set, a design, a DCF, a table of `lut`, or a run directory"
 
@@ -62,13 +62,9 @@ def load_parameters(path: str | Path, drive_map: DriveMap | None = None) -> Para
         if design.request.get("axis"):  # the rest of the drive stays as it is
             return axis_parameters(design)
         return _for_drive(design.parameter_set(), drive_map)
-    if schema == parameter_set.SCHEMA:
-        return _for_drive(parse_parameter_set(text, str(path)), drive_map)
-    raise ConfigError(
-        f"schema is {schema!r}, expected {design_file.SCHEMA!r} or {parameter_set.SCHEMA!r}",
-        where=str(path),
-        **(_tune_first(str(path)) if schema == MACHINE_SCHEMA else {"hint": AS_TUNE_WRITES}),
-    )
+    advice = _tune_first(str(path)) if schema == MACHINE_SCHEMA else {"hint": AS_TUNE_WRITES}
+    refuse_schema(schema, design_file.SCHEMA, parameter_set.SCHEMA, where=str(path), **advice)
+    return _for_drive(parse_parameter_set(text, str(path)), drive_map)
 
 
 def _for_drive(found: ParameterSet, drive_map: DriveMap | None) -> ParameterSet:

@@ -26,7 +26,7 @@ from pmsmtool.machine.machine_file import (
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
 from pmsmtool.plain_text import Summarised, Summary
-from pmsmtool.toml_file import parse_toml, toml_lines, toml_text
+from pmsmtool.toml_file import parse_toml, refuse_schema, toml_lines, toml_text
 
 NEXT_STEP = "make the design again: `pmsmtool tune MACHINE -o design.toml`"
 
@@ -204,10 +204,7 @@ def parse_design(text: str, *, where: str = "design.toml") -> Design:
     design.
     """
     tables = parse_toml(text, where=where)
-    schema = tables.get("schema")
-    if schema != SCHEMA:
-        hint = "give a design as `tune` writes it"
-        raise ConfigError(f"schema is {schema!r}, expected {SCHEMA!r}", where=where, hint=hint)
+    refuse_schema(tables.get("schema"), SCHEMA, where=where, hint="give a design as `tune` writes it")
     machine_part = tables.get("machine_file")
     if not isinstance(machine_part, dict):
         raise ConfigError("the table [machine_file] is missing", where=where)

@@ -36,7 +36,7 @@ from pmsmtool.drive_maps.wire_units import as_peak, counted_in, wire_unit
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.params.catalogue import BY_NAME, EVERY, Parameter
 from pmsmtool.params.parameter_set import TABLE_NAMES
-from pmsmtool.toml_file import line_of, parse_toml, toml_text
+from pmsmtool.toml_file import line_of, parse_toml, refuse_schema, toml_text
 
 NEXT_STEP = "firmware-params/README.md says what each key of a map means; the maps beside it are examples"
 
@@ -138,8 +138,7 @@ def _expected_unit(parameter: Parameter, form: str) -> str:
 def parse_drive_map(text: str, where: str = "map.toml") -> DriveMap:
     """Read a map file. Raises ConfigError: everything that is wrong with it, at once, each with its line."""
     document = parse_toml(text, where=where)
-    if document.get("schema") != SCHEMA:
-        raise ConfigError(f"schema is {document.get('schema')!r}, expected {SCHEMA!r}", where=where)
+    refuse_schema(document.get("schema"), SCHEMA, where=where)
     wrong: list[str] = []
 
     def complain(path: tuple[str, ...], what: str) -> None:

@@ -30,7 +30,7 @@ from pmsmtool.machine.parameters import (
 )
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS, resolved_simulation
 from pmsmtool.plain_text import Summarised, Summary
-from pmsmtool.toml_file import parse_toml, toml_lines, toml_text
+from pmsmtool.toml_file import parse_toml, refuse_schema, toml_lines, toml_text
 
 NAMED = "`pmsmtool sim list` names the profiles, `pmsmtool machine new` writes a file from a data sheet"
 """Next step where a machine is not found."""
@@ -173,10 +173,8 @@ def parse_machine(text: str, *, where: str = "machine file", folder: Path | None
         Where relative file names start; None refuses files beside the text.
     """
     tables = parse_toml(text, where=where)
-    schema = tables.pop("schema", None)
-    if schema != SCHEMA:
-        found = "has no schema" if schema is None else f"has the schema {schema!r}"
-        raise ConfigError(found, where=where, hint=f'a machine file starts with schema = "{SCHEMA}"')
+    hint = f'a machine file starts with schema = "{SCHEMA}"'
+    refuse_schema(tables.pop("schema", None), SCHEMA, where=where, hint=hint)
     return machine_from_tables(tables, where=where, folder=folder, lines=toml_lines(text))
 
 

@@ -22,7 +22,7 @@ from typing import Any
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_text
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY, LUT_CAPACITY_WORDS, SATURATION_VALUES
-from pmsmtool.toml_file import LARGEST_WHOLE, parse_toml, toml_text
+from pmsmtool.toml_file import LARGEST_WHOLE, parse_toml, refuse_schema, toml_text
 
 NEXT_STEP = (
     "`pmsmtool tune` and `pmsmtool export` write such a file; `pmsmtool param help NAME` shows a parameter's bounds"
@@ -115,11 +115,7 @@ def parse_parameter_set(text: str, where: str = "params.toml") -> ParameterSet:
     not fit the content; all violations at once.
     """
     document = parse_toml(text, where=where)
-    schema = document.pop("schema", None)
-    if schema != SCHEMA:
-        raise ConfigError(
-            f"schema is {schema!r}, expected {SCHEMA!r}", where=where, hint="give a params.toml as `tune` writes it"
-        )
+    refuse_schema(document.pop("schema", None), SCHEMA, where=where, hint="give a params.toml as `tune` writes it")
     name, content = document.pop("name", ""), document.pop("content", None)
     provenance = document.pop("provenance", {})
     values, tables, wrong = _read_groups(document)

@@ -207,6 +207,7 @@ BAD = {
     "no file": (["csv", "missing.toml"], "no such file|cannot be read"),
     "not toml": (["csv", "text.toml"], "is not TOML"),
     "another schema": (["csv", "machine.toml"], "schema is"),
+    "no schema": (["csv", "bare.toml"], "has no schema, expected 'pmsmtool.design/1' or 'pmsmtool.params/1'"),
     "no design in the folder": (["csv", "empty"], "no design in this folder"),
     "a sheet without values": (["csv", "empty.dcf"], "holds no parameter|no usable|object"),
     "out of bounds": (["dcf", "bounds.toml", "-o", "out"], "outside"),
@@ -228,6 +229,7 @@ def test_bad_input_writes_nothing(
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.toml").write_text("R_s = \n")
     (tmp_path / "machine.toml").write_text('schema = "pmsmtool.machine/1"\n')
+    (tmp_path / "bare.toml").write_text("a = 1\n")
     (tmp_path / "empty.dcf").write_text("[FileInfo]\nFileName=x\n")
     (tmp_path / "bounds.toml").write_text(ParameterSet({"motor.pole_pairs": 65}).to_toml())
     (tmp_path / "gain.toml").write_text(ParameterSet({"motor.pole_pairs": 6}).to_toml())

@@ -152,7 +152,7 @@ def test_the_message_shows_all_of_them():
         ("name = ", "is not TOML"),
         ("[machine\n", "is not TOML"),
         ("", "has no schema"),
-        ('schema = "pmsmtool.design/1"', "has the schema 'pmsmtool.design/1'"),
+        ('schema = "pmsmtool.design/1"', "schema is 'pmsmtool.design/1'"),
     ],
 )
 def test_what_is_no_machine_file(text, says):

@@ -392,7 +392,7 @@ def test_find_drive_takes_designs_and_run_directories(tmp_path, drive):
         assert found.origin == "design"
         assert found.params.content_hash() == drive.params.content_hash()
     (tmp_path / "other.toml").write_text('schema = "something/1"\n', encoding="utf-8")
-    with pytest.raises(ConfigError, match="has the schema"):
+    with pytest.raises(ConfigError, match="schema is"):
         find_drive(str(tmp_path / "other.toml"))
     with pytest.raises(ConfigError, match="interior-2k2"):
         find_drive("interior-2k")
