@@ -19,6 +19,7 @@ import click
 from pmsmtool.cli.options import MotionOptions
 from pmsmtool.cli.output import Output, show
 from pmsmtool.errors import ConfigError, Declined
+from pmsmtool.files import ELSEWHERE, USER_ROOM, refuse_full, user_folder
 
 if TYPE_CHECKING:
     from pmsmtool.run_directory import RunDirectory
@@ -114,6 +115,7 @@ def _ask(
     serial: int,
     out: Output,
 ) -> Consent:
+    refuse_full(user_folder(), USER_ROOM, hint=ELSEWHERE)  # first: nobody agrees to what cannot be done
     # shown even when quiet: nobody consents to what he has not seen; a simulated drive may go without
     if not (simulated and options.yes and out.verbosity < 0):
         for line in text:
