@@ -92,6 +92,11 @@ class StageProgress:
     def say(self, text: str) -> None:
         """Show a step inside the stage."""
         text = plain(text)
+        if text.startswith("interrupted"):  # the stage ends here, not with its last step
+            self._stage, self._share = "", 0.0
+            if self._live is not None:
+                self.pause()
+                self.resume()
         reached = (share for start, share in STEPS.get(self._stage, ()) if text.startswith(start))
         self._share = next(reached, self._share)
         if self._live is None or self._task is None:

@@ -108,6 +108,19 @@ def test_the_bar_has_share_remaining_time_and_action(monkeypatch: pytest.MonkeyP
     assert "i_q steps of +-1 A" in terminal.getvalue()
 
 
+def test_an_interrupted_stage_has_no_share_and_no_time_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last step, in which the voltage goes off, showed 98 % and 0:00 left whatever had been reached."""
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    progress = StageProgress(Output())
+    progress.begin("identify", 1, 7)
+    for text in ("noise: at rest", "interrupted: stopping the machine", "voltage off, drive restored"):
+        progress.say(text)
+    progress.end(Stage("identify", "interrupted", 3.0), 1, 7)
+    assert "1 %" in terminal.getvalue() and "98 %" not in terminal.getvalue()
+
+
 def test_every_step_of_the_bar_is_said_somewhere() -> None:
     rooms = ("measurement", "experiments", "drive", "flash", "proof", "identification", "design")
     said = "".join(path.read_text() for room in rooms for path in (ROOT / room).rglob("*.py"))
