@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pmsmtool.axis.loops import AxisGains, AxisPath, best_share, following_error
+from pmsmtool.axis.loops import AxisGains, AxisPath, Lifted, best_share, following_error
 from pmsmtool.axis.move import Move, Profile, jerk_limited, plan
 from pmsmtool.axis.search import Box, Case, Judged, Limits, stiffest
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
@@ -44,7 +44,11 @@ AXIS_ROWS = frozenset((TORQUE_PER_AMPERE, INCREMENTS, *AXIS_GAINS, *NOTCH, *PROF
 SPEED_LOOP, POSITION_LOOP = "axis_speed", "axis_position"
 
 LOOSEST = Limits(20.0, 12.0)
-"""Least phase margin and largest |S| that may be asked for, and with which stored gains are kept."""
+"""Least phase margin and largest |S| that may be asked for."""
+AS_WELL = 0.02
+"""Gains and following errors that differ by less (relative) are the same: what a count of a drive may change."""
+ROUNDED_DEG, ROUNDED_DB = 0.5, 0.1
+"""What counts of a drive may take of the margins asked for: a learned map's took 0.3 degrees of one load of ten."""
 ASSUMED_RATE_HZ = 1000.0
 """Rate of the loops of a drive that says none."""
 OWN_TORQUE = 0.1
@@ -113,6 +117,12 @@ class AxisRequest:
         given = {"loop_rate_hz": self.loop_rate_hz, "axis_speed_filter_hz": self.speed_filter_hz}
         return asked | {name: value for name, value in given.items() if value is not None}
 
+    @classmethod
+    def of(cls, design: Design) -> AxisRequest:
+        """Return what was asked of a design's axis: :meth:`table` read back."""
+        names = ("axis_phase_margin_deg", "axis_peak_db", "loop_rate_hz", "axis_speed_filter_hz")
+        return cls(*(design.request.get(name) for name in names))  # type: ignore[arg-type]
+
 
 @dataclass(frozen=True, slots=True)
 class AxisDrive:
@@ -146,6 +156,11 @@ class AxisDrive:
         """Whether one controller of the position gives the torque."""
         return PID[0] in self.offers
 
+    @property
+    def jerks(self) -> bool:
+        """Whether its moves are limited in jerk."""
+        return self.own_core or PROFILE[3] in self.offers
+
     def feeds(self, name: str) -> bool:
         """Whether a feed-forward acts as designed: it is written, or a person enters the whole axis by hand."""
         return name in self.offers or not self.offers & {CASCADE[0], PID[0]}
@@ -159,6 +174,22 @@ class AxisDesign:
     box: Box
     speed: AxisGains
     position: AxisGains
+
+    def noted(self, facts: Mapping[str, Scalar], *notes: str) -> AxisDesign:
+        """Return the design with more facts and notes."""
+        design = self.design
+        return replace(self, design=replace(design, facts={**design.facts, **facts}, notes=(*design.notes, *notes)))
+
+    @property
+    def limits(self) -> Limits:
+        """What was asked for."""
+        asked = AxisRequest.of(self.design)
+        return Limits(asked.phase_margin_deg, asked.peak_db)
+
+    @property
+    def friction_nm(self) -> float:
+        """Coulomb friction (N m)."""
+        return self.design.machine.machine.tau_c_nm or 0.0
 
     def with_held(self, held: Mapping[str, float]) -> Design:
         """Return the design with values as a drive holds them, by catalogue name, judged by the loops these make."""
@@ -186,63 +217,90 @@ def from_pid(K_P: float, K_I: float, K_D: float, like: AxisGains) -> AxisGains:
 
 
 def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisDrive) -> AxisDesign:
-    """Return a design of the axis, with the gains a drive holds where a move is predicted to be followed worse without.
+    """Return a design of the axis, with the gains a drive holds where they follow better with the margins asked for.
 
     What is compared is the largest following error of one move: that of the loops, with the feed-forward that belongs
-    to the gains, and what Coulomb friction adds. Stored gains with margins beyond :data:`LOOSEST` at a
-    corner of the box are not kept, and the design says so.
+    to the gains, and what Coulomb friction adds. Stored gains that follow better with
+    less margin than asked for are not kept. ``axis_stored_gains`` says what became of them.
 
     ``stored``: what the drive holds, by catalogue name; without all gains of its controller nothing is compared.
     """
-    design, box = made.design, made.box
+    design, box, limits = made.design, made.box, made.limits
     speed, position = _stored_gains(stored, made, drive)
     if speed is None or position is None:
         note = "no comparison with the stored gains: those of a loop are missing or zero"
-        return replace(made, design=replace(design, notes=(*design.notes, note)))
+        return made.noted({"axis_stored_gains": "not compared"}, note)
     judged = [box.judged(position, "position")]
     if not drive.pid:  # one controller of the position moves alone: the controller of the speed stays as designed
         judged.append(box.judged(speed, "speed"))
     phase, peak = min(found.phase_deg for found in judged), max(found.S_db for found in judged)
-    stable = math.isfinite(phase)
-    J, friction = box.path.shaft.J, design.machine.machine.tau_c_nm or 0.0
-    jerk = float(design.facts["axis_jerk_rad_s3"]) if drive.own_core or PROFILE[3] in drive.offers else math.inf
-    limits = Profile(float(design.facts["axis_speed_rad_s"]), float(design.facts["axis_acceleration_rad_s2"]), jerk)
-    move = plan(WAY_RAD, limits)
-    plain, added = following_error(box.plant, box.path, position, move, stored.get(CASCADE[1], 0.0))
-    held = stored.get(CASCADE[2], 0.0) / J
-    wave = plain - plain.mean() + held * (added - added.mean())
-    before = float(np.max(np.abs(wave))) + friction / position.pid[0]
     after = float(design.facts["axis_following_error_rad"]) + float(design.facts["axis_friction_error_rad"])
-    told: dict[str, Scalar] = {"axis_error_rad": after}
-    if not stable:
+    if not math.isfinite(phase):
         note = "the stored gains are unstable somewhere in the tolerance box: they are not kept"
-        return replace(made, design=replace(design, facts={**design.facts, **told}, notes=(*design.notes, note)))
-    told["axis_stored_error_rad"] = before
-    if after <= before:
-        return replace(made, design=replace(design, facts={**design.facts, **told}))
-    if phase < LOOSEST.phase_deg or peak > LOOSEST.S_db:
-        note = (
-            f"the stored gains would follow better ({math.degrees(before):.3g} against {math.degrees(after):.3g} deg), "
-            f"with {phase:.3g} deg and {peak:.3g} dB over the tolerance box: they are not kept"
-        )
-        return replace(made, design=replace(design, facts={**design.facts, **told}, notes=(*design.notes, note)))
-    share, error = _best_forward(box, position, move, drive)
-    errors = f"{math.degrees(before):.3g} deg of following error, {math.degrees(after):.3g} designed"
-    how = f"as the drive holds it: {errors}"
-    gains = {name: DesignValue(stored[name], how, design.values[name].loop) for name in _gain_rows(drive)}
+        return made.noted({"axis_error_rad": after, "axis_stored_gains": "not kept: unstable"}, note)
+    move = _own_move(design, drive)
+    before = move_error_rad(box.path, box.plant, position, move, stored, made.friction_nm)
+    told: dict[str, Scalar] = {
+        "axis_error_rad": after, "axis_stored_error_rad": before, "axis_stored_phase_least_deg": phase,
+        "axis_stored_S_peak_db": peak, "axis_stored_gains": "not kept: the designed ones follow as well",
+    }  # fmt: skip
+    if all(abs(stored[name] / design[name] - 1.0) < AS_WELL for name in _gain_rows(drive)):
+        return made.noted(told | {"axis_stored_gains": "as designed"}, "the drive holds the designed gains already")
+    if after <= (1.0 + AS_WELL) * before:
+        return made.noted(told)
+    if phase >= limits.phase_deg and peak <= limits.S_db:
+        return _kept(made.noted({**told, "axis_stored_gains": "kept"}), speed, position, move, drive)
+    note = (
+        f"the stored gains are not kept: {phase:.3g} deg and {peak:.3g} dB over the tolerance box, asked for are "
+        f"{limits}. They would follow better: {math.degrees(before):.3g} against {math.degrees(after):.3g} deg; "
+        "--axis-phase-margin-deg and --axis-peak-db allow less margin"
+    )
+    return made.noted({**told, "axis_stored_gains": "not kept: less margin than asked for"}, note)
+
+
+def _kept(made: AxisDesign, speed: AxisGains, position: AxisGains, move: Move, drive: AxisDrive) -> AxisDesign:
+    """Return a design of the axis with the gains that the drive holds, and the feed-forward that belongs to them."""
+    design, J = made.design, made.box.path.shaft.J
+    share, error = _best_forward(made.box, position, move, drive)
+    friction = made.friction_nm / position.pid[0]
+    values = {SPEED[0]: speed.K_p, SPEED[1]: speed.K_i, CASCADE[0]: position.K_v}
+    if drive.pid:
+        values = dict(zip(PID, position.pid, strict=False))
+    values |= zip(NOTCH, (position.notch.hz, position.notch.zeta_num, position.notch.zeta_den), strict=True)
+    how = "as the drive holds it"
+    gains = {name: DesignValue(value, how, design.values[name].loop) for name, value in values.items()}
     forward = f"{share:g} of the inertia: the least predicted following error"
     gains |= {
         name: DesignValue(share * J, forward)
         for name in (*CASCADE[2:], SPEED_FORWARD[0])
         if name in design.values and name in drive.offers
     }
-    told |= {
-        "axis_inertia_ff_share": share, "axis_following_error_rad": error,
-        "axis_friction_error_rad": friction / position.pid[0], "axis_error_rad": error + friction / position.pid[0],
+    facts = {
+        "axis_inertia_ff_share": share, "axis_following_error_rad": error, "axis_friction_error_rad": friction,
+        "axis_error_rad": error + friction,
     }  # fmt: skip
-    note = "the stored gains are kept: the designed ones, with the margins asked for, would follow worse"
-    base = replace(design, facts={**design.facts, **told}, notes=(*design.notes, note))
-    return AxisDesign(_judged(base, gains, box, speed, position), box, speed, position)
+    base = made.noted(facts, "the stored gains are kept: the designed ones would follow worse").design
+    return replace(made, design=_judged(base, gains, made.box, speed, position), speed=speed, position=position)
+
+
+def _own_move(design: Design, drive: AxisDrive) -> Move:
+    """Return the move of a design by half a turn, at its limits, as the drive makes it."""
+    speed, acceleration, jerk = (
+        float(design.facts[f"axis_{name}"]) for name in ("speed_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
+    )
+    return plan(WAY_RAD, Profile(speed, acceleration, jerk if drive.jerks else math.inf))
+
+
+def move_error_rad(
+    path: AxisPath, plant: Lifted, gains: AxisGains, move: Move, held: Mapping[str, float], friction_nm: float
+) -> float:
+    """Return the largest following error (rad) of a move there and back: that of the loops, and what friction adds.
+
+    ``held``: the feed-forwards that a drive holds, by catalogue name.
+    """
+    plain, added = following_error(plant, path, gains, move, held.get(CASCADE[1], 0.0))
+    wave = plain - plain.mean() + held.get(CASCADE[2], 0.0) / path.shaft.J * (added - added.mean())
+    return float(np.max(np.abs(wave))) + friction_nm / gains.pid[0]
 
 
 def _best_forward(box: Box, gains: AxisGains, move: Move, drive: AxisDrive) -> tuple[float, float]:
@@ -312,9 +370,7 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
         design, request=asked, facts=facts, values=kept, notes=(*design.notes, *notes),
         loops={name: loop for name, loop in design.loops.items() if name != "speed"},
     )  # fmt: skip
-    jerk = profile if drive.own_core or PROFILE[3] in drive.offers else replace(profile, jerk=math.inf)
-    move = plan(WAY_RAD, jerk)
-    share, error = _best_forward(box, position, move, drive)
+    share, error = _best_forward(box, position, _own_move(base, drive), drive)
     predicted: dict[str, Scalar] = {
         "axis_inertia_ff_share": share,
         "axis_following_error_rad": error,
@@ -346,6 +402,12 @@ def _judged(
     for name, found in ((SPEED_LOOP, box.judged(speed, "speed")), (POSITION_LOOP, box.judged(position, "position"))):
         loops[name] = found.nominal.loop
         facts |= _facts(name, found)
+    asked = AxisRequest.of(design)
+    facts["axis_margins_kept"] = all(
+        float(facts[f"{name}_phase_least_deg"]) >= asked.phase_margin_deg - ROUNDED_DEG
+        and float(facts[f"{name}_S_peak_db"]) <= asked.peak_db + ROUNDED_DB
+        for name in (SPEED_LOOP, POSITION_LOOP)
+    )
     return replace(design, values={**design.values, **values}, loops=loops, facts=facts)
 
 

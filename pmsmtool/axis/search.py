@@ -77,6 +77,9 @@ class Limits:
     phase_deg: float = 45.0
     S_db: float = 6.0
 
+    def __str__(self) -> str:
+        return f"{self.phase_deg:.3g} deg and {self.S_db:.3g} dB"
+
     def holds(self, found: AxisMargins) -> bool:
         """Whether a loop is stable and keeps both."""
         loop = found.loop

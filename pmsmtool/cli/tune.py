@@ -99,7 +99,7 @@ if TYPE_CHECKING:
 @click.option("--loop-rate-hz", type=HZ, metavar="HZ", help="Rate of the drive's speed and position loops.  "
               "[default: as its map states]")  # fmt: skip
 @click.option("--stored", type=FILE, metavar="FILE", help="What the drive holds (`pmsmtool backup`): its gains are "
-              "kept where the designed ones would follow worse.")  # fmt: skip
+              "kept where they follow better with the margins asked for.")  # fmt: skip
 @overspeed_option
 @map_option
 @click.option("--drive-bandwidth-hz", type=HZ, metavar="HZ", help="Current bandwidth of a drive with fixed "

@@ -140,7 +140,7 @@ def design_axis(
     drive_map: DriveMap,
     stored: Mapping[str, float] | None = None,
 ) -> Design:
-    """Design the axis of a machine on a drive; with what the drive holds, never for a larger following error than that.
+    """Design the axis of a machine on a drive; what it holds is kept where that follows better with enough margin.
 
     Raises ConfigError: the machine file has no inertia, or gains do not fit the drive's types; DesignInfeasible: no
     gains keep the margins over the tolerance box.
@@ -174,6 +174,12 @@ def design_axis(
     notes += tuple(f"{name}: {wanted.values[name]:.4g} is designed, slower by what its objects hold" for name in slower)
     notes += tuple(f"{name}: {wanted.values[name]:.4g} is designed, its object holds no less" for name in faster)
     notes += tuple(f"{name}: {wanted.values[name]:.4g} is designed, its object holds no more" for name in less)
+    if not design.facts["axis_margins_kept"]:
+        phase, peak = (
+            worst(float(design.facts[f"axis_{loop}_{fact}"]) for loop in ("speed", "position"))
+            for worst, fact in ((min, "phase_least_deg"), (max, "S_peak_db"))
+        )
+        notes += (f"margins not met: {phase:.3g} deg and {peak:.3g} dB, asked for are {made.limits}",)
     if CASCADE[2] in less:  # the errors were predicted with all of it
         kept = {name: fact for name, fact in design.facts.items() if name not in PREDICTED}
         design = replace(design, facts=kept)
