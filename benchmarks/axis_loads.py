@@ -16,7 +16,8 @@ With ``--drive FAMILY`` a simulated drive of that family does the whole job over
 gives: `backup`, `tune --axis --stored`, `move`, `flash-params`, `move`. Stored are the gains of its face (crossover 60
 rad/s and 15 1/s for the whole inertia, no feed-forward). The move is of 60 degrees at half of the designed
 acceleration, at most 300 rad/s2; after `map learn` as the design gives it within the drive's own limits of current.
-Said besides are how long both moves kept the drive, and why a load got no comparison.
+Said besides are how long both moves kept the drive, their following errors over the predicted ones, and why a load got
+no comparison.
 
 Families whose gains have no published unit are nodes of a ``--table`` (``sim/foreign/file_rows.py``) with gains that a
 seed drew for the motor alone (``sim/foreign/drawn_gains.py``). There `map learn` comes first, on the uncoupled motor;
@@ -178,10 +179,10 @@ def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float
         done("backup", "-o", "stored.json", *drive)
         made = done("tune", "known.toml", "-o", "axis.toml", "--axis", "--stored", "stored.json", "--map", used)
         acceleration = min(FASTEST, SHARE_OF_ACCELERATION * float(made["facts"]["axis_acceleration_rad_s2"]))
-        limits = ("--speed", "300rpm", "--acceleration", f"{acceleration:.4g}")
+        limits: tuple[str, ...] = ("--speed", "300rpm", "--acceleration", f"{acceleration:.4g}")
         if family in LEARNED:  # the stored gains are for the motor alone, and its drive may give little torque
-            limits = ("--speed", "40rpm", "--design", "axis.toml")
-        move = ("move", "--by", "60deg", *limits, *drive, "--yes")
+            limits = ("--speed", "40rpm")
+        move = ("move", "--by", "60deg", *limits, "--design", "axis.toml", *drive, "--yes")
         code, before, reason = asked(*move, "--json")
         if code != 0 and not reason.startswith(UNABLE):
             raise RuntimeError(f"move with the stored gains: exit {code}: {reason}")
@@ -194,11 +195,20 @@ def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float
     seconds = sum(run.seconds for run in runs if run is not None)
     ratio = errors[1] / errors[0]
     stored = f"{errors[0]:.3g} deg" if math.isfinite(errors[0]) else f"cannot do it ({reason})"
+    told = "; ".join(foretold(one) for one in (before, after) if one)
     line = (
         f"{known.machine.resonance_hz:.0f} Hz, load {float(made['facts']['axis_load_ratio']):.2g}: stored "
-        f"{stored}, with --stored x {ratio:.2f} ({phase:.0f} deg, {peak:.1f} dB, {seconds:.0f} s)"
+        f"{stored}, with --stored x {ratio:.2f} ({phase:.0f} deg, {peak:.1f} dB, {seconds:.0f} s; {told}; stored "
+        f"gains {made['facts']['axis_stored_gains']})"
     )
     return ratio, phase, peak, seconds, line
+
+
+def foretold(answer: Any) -> str:
+    """Return the following error of a move over both ends of the predicted one."""
+    error, ends = answer["move"]["error_peak_rad"], answer["predicted"]
+    least, most = (error / ends[f"error_{end}_rad"] for end in ("least", "most"))
+    return f"measured over predicted {most:.2f} to {least:.2f}"
 
 
 def compare_on(family: str, first: int, loads: int, table: str) -> None:

@@ -22,7 +22,7 @@ from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.machine.two_masses import Mechanics, mechanics_of
+from pmsmtool.machine.two_masses import Mechanics, mechanics_of, shafts_of
 from pmsmtool.params.catalogue import INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
 from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 
@@ -226,10 +226,11 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     ``stored``: what the drive holds, by catalogue name; without all gains of its controller nothing is compared.
     """
     design, box, limits = made.design, made.box, made.limits
-    speed, position = _stored_gains(stored, made, drive)
-    if speed is None or position is None:
+    position = held_loop(stored, made.position, drive)
+    if position is None:
         note = "no comparison with the stored gains: those of a loop are missing or zero"
         return made.noted({"axis_stored_gains": "not compared"}, note)
+    speed = made.speed if drive.pid else position
     judged = [box.judged(position, "position")]
     if not drive.pid:  # one controller of the position moves alone: the controller of the speed stays as designed
         judged.append(box.judged(speed, "speed"))
@@ -239,7 +240,7 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
         note = "the stored gains are unstable somewhere in the tolerance box: they are not kept"
         return made.noted({"axis_error_rad": after, "axis_stored_gains": "not kept: unstable"}, note)
     move = _own_move(design, drive)
-    before = move_error_rad(box.path, box.plant, position, move, stored, made.friction_nm)
+    before, _ = move_peaks(box.path, box.plant, position, move, stored, made.friction_nm)
     told: dict[str, Scalar] = {
         "axis_error_rad": after, "axis_stored_error_rad": before, "axis_stored_phase_least_deg": phase,
         "axis_stored_S_peak_db": peak, "axis_stored_gains": "not kept: the designed ones follow as well",
@@ -291,16 +292,18 @@ def _own_move(design: Design, drive: AxisDrive) -> Move:
     return plan(WAY_RAD, Profile(speed, acceleration, jerk if drive.jerks else math.inf))
 
 
-def move_error_rad(
+def move_peaks(
     path: AxisPath, plant: Lifted, gains: AxisGains, move: Move, held: Mapping[str, float], friction_nm: float
-) -> float:
-    """Return the largest following error (rad) of a move there and back: that of the loops, and what friction adds.
+) -> tuple[float, float]:
+    """Return the largest following error (rad) and torque (N m) of a move there and back.
+
+    The error is that of the loops, and what friction adds without integral part; the torque has no limit.
 
     ``held``: the feed-forwards that a drive holds, by catalogue name.
     """
     plain, added = following_error(plant, path, gains, move, held.get(CASCADE[1], 0.0))
-    wave = plain - plain.mean() + held.get(CASCADE[2], 0.0) / path.shaft.J * (added - added.mean())
-    return float(np.max(np.abs(wave))) + friction_nm / gains.pid[0]
+    error, torque = np.max(np.abs(plain + held.get(CASCADE[2], 0.0) / path.shaft.J * added), axis=1)
+    return float(error) + friction_nm / gains.pid[0], float(torque) + friction_nm
 
 
 def _best_forward(box: Box, gains: AxisGains, move: Move, drive: AxisDrive) -> tuple[float, float]:
@@ -314,18 +317,17 @@ def _gain_rows(drive: AxisDrive) -> tuple[str, ...]:
     return PID[:3] if drive.pid else (*SPEED, *CASCADE[:1])
 
 
-def _stored_gains(
-    stored: Mapping[str, float], made: AxisDesign, drive: AxisDrive
-) -> tuple[AxisGains | None, AxisGains | None]:
-    """Return the loops that stored gains make; None where one is missing or off."""
-    if not all(stored.get(name, 0.0) > 0.0 for name in _gain_rows(drive)):
-        return None, None
-    notch = Notch(stored.get(NOTCH[0], 0.0), *(stored.get(name, 1.0) for name in NOTCH[1:]))
+def held_loop(held: Mapping[str, float], like: AxisGains, drive: AxisDrive) -> AxisGains | None:
+    """Return the loop of the position that gains of a drive make; None where one of them is missing or off.
+
+    ``like``: gains of a similar loop, for the K_v of one controller of the position.
+    """
+    if not all(held.get(name, 0.0) > 0.0 for name in _gain_rows(drive)):
+        return None
+    notch = Notch(held.get(NOTCH[0], 0.0), *(held.get(name, 1.0) for name in NOTCH[1:]))
     if drive.pid:
-        position = from_pid(stored[PID[0]], stored[PID[1]], stored[PID[2]], made.position)
-        return made.speed, replace(position, notch=notch)
-    speed = AxisGains(stored[SPEED[0]], stored[SPEED[1]], stored[CASCADE[0]], notch)
-    return speed, speed
+        return replace(from_pid(held[PID[0]], held[PID[1]], held[PID[2]], like), notch=notch)
+    return AxisGains(held[SPEED[0]], held[SPEED[1]], held[CASCADE[0]], notch)
 
 
 def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDesign:
@@ -349,6 +351,10 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
     else:
         speed = position = stiffest(box, limits, notch=notch, fed=drive.feeds(CASCADE[1]))
     profile = profile_of(design, shaft, position, path.T)
+    unknown = [case.shaft.resonance_hz for case in box.cases if case.shaft is not None]
+    if unknown:
+        swings = f"the shaft has play, or is not rigid: it may swing from {min(unknown):.3g} to {max(unknown):.3g} Hz"
+        notes = (*notes, f"{swings}, and the loops keep their margins with all of that")
     if PROFILE[3] not in drive.offers and PROFILE[0] in drive.offers:
         notes = (*notes, "no object for the jerk (0x60A4): moves are trapezoids")
     how = f"stiffest with {request.phase_margin_deg:g} deg and |S| below {request.peak_db:g} dB over the tolerance box"
@@ -464,8 +470,9 @@ def cases(source: MachineFile, drive: AxisDrive) -> tuple[Case, ...]:
         torque = OWN_TORQUE if drive.holds_torque else UNKNOWN_KIND
     ends = ((1.0 - torque) / (1.0 + inertia), (1.0 + torque) / (1.0 - min(inertia, 0.8)))
     f_r = source.machine.resonance_hz
-    if f_r is None:
-        return tuple(Case(end) for end in ends)
+    if f_r is None:  # with play, or where what swings is not known, elastic shafts that it may be
+        others = (None, *shafts_of(source)[1:])
+        return tuple(Case(end, shaft=shaft) for end in ends for shaft in others)
     doubt = _half_width(source, "resonance_hz", f_r, RESONANCE)
     zeta = source.machine.resonance_zeta
     least = 1.0 - (_half_width(source, "resonance_zeta", zeta, DAMPING_SHARE) if zeta else DAMPING_SHARE)

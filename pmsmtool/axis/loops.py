@@ -302,7 +302,9 @@ SHARES = np.linspace(0.0, 1.0, 21)
 def following_error(
     plant: Lifted, path: AxisPath, gains: AxisGains, move: Move, speed_share: float = 1.0
 ) -> tuple[Array, Array]:
-    """Return the following error (rad) of a move there and back, periodic, shape (n,), by samples of the loops.
+    """Return following error (rad) and torque (N m) of a move there and back, shape (2, n), by samples of the loops.
+
+    Both are periodic and without their mean.
 
     ``speed_share``: of the move's speed, that a cascade feeds forward.
 
@@ -327,9 +329,10 @@ def following_error(
     if path.structure == "cascade":
         control = slip if path.pll_rad_s else _speed_control(path, gains, z)
         asked = control * (gains.K_v * reference + speed_share * fast)
-    plain = reference - seen[0] * asked / back
-    added = -seen[0] * path.shaft.J * force / back
-    return tuple(np.fft.irfft(np.concatenate(([0.0], one)), 2 * half) for one in (plain, added))  # type: ignore[return-value]
+    torque, more = asked / back, path.shaft.J * force / back
+    plain, added = np.zeros((2, 2, half + 1), np.complex128)
+    plain[:, 1:], added[:, 1:] = (reference - seen[0] * torque, torque), (-seen[0] * more, more)
+    return np.fft.irfft(plain, 2 * half), np.fft.irfft(added, 2 * half)
 
 
 def _there_and_back(move: Move, t: Array) -> list[tuple[Array, Array]]:
@@ -346,6 +349,6 @@ def _speed_control(path: AxisPath, gains: AxisGains, z: NDArray[np.complex128]) 
 
 def best_share(plain: Array, added: Array) -> tuple[float, float]:
     """Return the share of the inertia whose feed-forward leaves the least peak of the error, and that peak (rad)."""
-    peaks = np.max(np.abs(plain - plain.mean() + SHARES[:, None] * (added - added.mean())), axis=1)
+    peaks = np.max(np.abs(plain[0] + SHARES[:, None] * added[0]), axis=1)
     best = int(np.argmin(peaks))
     return float(SHARES[best]), float(peaks[best])

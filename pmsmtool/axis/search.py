@@ -26,6 +26,7 @@ from pmsmtool.axis.loops import AxisGains, AxisPath, Lifted, Loop, closed_loop_p
 from pmsmtool.design.loops.sampled_loop import LoopMargins
 from pmsmtool.design.loops.speed_loop import Notch
 from pmsmtool.errors import DesignInfeasible
+from pmsmtool.machine.two_masses import Mechanics
 
 LOOPS: tuple[Loop, ...] = ("speed", "position")
 
@@ -60,13 +61,24 @@ SECANTS = 40
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One corner of the box: a factor of the torque over the inertia, and of the resonance and its damping."""
+    """One corner of the box: a factor of the torque over the inertia, and of the resonance and its damping.
+
+    ``shaft``: another one than the nominal, which this one may be.
+    """
 
     gain: float = 1.0
     frequency: float = 1.0
     damping: float = 1.0
+    shaft: Mechanics | None = None
+
+    def of(self, nominal: Mechanics) -> Mechanics:
+        """Return the shaft of this corner."""
+        return (self.shaft or nominal).scaled(1.0, self.frequency, self.damping)
 
     def __str__(self) -> str:
+        if self.shaft is not None:
+            swings = f"load {self.shaft.load_ratio:.3g} times the motor, swinging at {self.shaft.resonance_hz:.3g} Hz"
+            return f"gain x {self.gain:.3g}, {swings}"
         return f"gain x {self.gain:.3g}, resonance x {self.frequency:.3g}, its damping x {self.damping:.3g}"
 
 
@@ -112,25 +124,23 @@ class Box:
     def __init__(self, path: AxisPath, cases: Sequence[Case]) -> None:
         self.path = path
         self.cases = (Case(), *cases)
-        shafts = {(case.frequency, case.damping): None for case in self.cases}
-        self._plants = {
-            key: lifted(replace(path, shaft=path.shaft.scaled(1.0, *key))) for key in shafts
-        }  # fmt: skip
-        self._seen: dict[tuple[float, float], tuple[Array, Complex]] = {}
-        for key, plant in self._plants.items():
+        self._shafts = {case: case.of(path.shaft) for case in self.cases}
+        self._plants = {shaft: lifted(replace(path, shaft=shaft)) for shaft in dict.fromkeys(self._shafts.values())}
+        self._seen: dict[Mechanics, tuple[Array, Complex]] = {}
+        for shaft, plant in self._plants.items():
             omega = grid(plant)
-            self._seen[key] = omega, plant.at(omega)
+            self._seen[shaft] = omega, plant.at(omega)
 
     def may_hold(self, gains: AxisGains, limits: Limits, loops: Sequence[Loop] = LOOPS) -> bool:
         """Whether loops keep the limits on the grid, at every corner, and are stable."""
         sensitivity = 10.0 ** (-limits.S_db / 20.0)
         least = math.radians(limits.phase_deg)
-        for (frequency, damping), (omega, seen) in self._seen.items():
-            plant = self._plants[frequency, damping]
+        for shaft, (omega, seen) in reversed(self._seen.items()):  # the nominal one rejects least
+            plant = self._plants[shaft]
             for loop in loops:
                 values = open_loop(plant, self.path, gains, loop, omega, seen)
                 for case in self.cases:
-                    if (case.frequency, case.damping) != (frequency, damping):
+                    if self._shafts[case] != shaft:
                         continue
                     scaled = values * case.gain
                     if float(np.min(np.abs(1.0 + scaled))) < sensitivity:
@@ -147,10 +157,15 @@ class Box:
     @property
     def plant(self) -> Lifted:
         """The path with the nominal shaft."""
-        return self._plants[1.0, 1.0]
+        return self._plants[self._shafts[Case()]]
+
+    @property
+    def plants(self) -> Iterator[Lifted]:
+        """The path at every corner, the nominal one first."""
+        return map(self._scaled, self.cases)
 
     def _scaled(self, case: Case) -> Lifted:
-        plant = self._plants[case.frequency, case.damping]
+        plant = self._plants[self._shafts[case]]
         return replace(plant, b=plant.b * case.gain, d=plant.d * case.gain)
 
     def judged(self, gains: AxisGains, loop: Loop) -> Judged:

@@ -26,7 +26,7 @@ from pmsmtool.cli.options import (
 from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
-    from pmsmtool.axis.move import MoveResult
+    from pmsmtool.axis.move import MoveResult, Profile
     from pmsmtool.drive.position_drive import PositionDrive
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.machine.parameters import Estimate
@@ -82,6 +82,8 @@ def move_command(
     """
     from pmsmtool.axis.move import UNITS, move_result, shown
     from pmsmtool.cli.consent import ask_motion
+    from pmsmtool.commissioning.designed_move import foretold_move, limits_of_move
+    from pmsmtool.design.design_file import load_design
     from pmsmtool.drive.envelope import Envelope
     from pmsmtool.drive.guard import guarded
     from pmsmtool.drive.motion_objects import held_current_limits, low_limits
@@ -107,7 +109,9 @@ def move_command(
         kept = held_current_limits(drive.node, drive.rated_apk)
         given = min([i_max, *(apk for _, apk in kept)])
         refuse_no_current(drive.node, given)
-        profile = _profile(design, given, speed_rad_s, acceleration)
+        made = None if design is None else load_design(design)
+        limits = None if made is None else limits_of_move(made, given, speed_rad_s, acceleration)
+        profile = _asked(limits, speed_rad_s, acceleration)
         lent, find = _lent(drive, profile)
         speed = profile.get(_SPEED) or _held(drive, _SPEED)
         speed_max = motion.speed_max_rad_s or (SPEED_MARGIN * rad_s_from_rpm(speed) if speed else None)
@@ -121,12 +125,14 @@ def move_command(
         envelope.refuse_gravity()
         gains = drive.held_gains()
         drive.error_limit_rad = ERROR_SHARE * abs(way_rad)
+        foretold = made and limits and foretold_move(made, drive.node.map, gains, way_rad, limits, given)
         lines = [
             *envelope.lines(),
             *low_limits(drive.node, drive.rated_apk),
             f"the shaft moves by {math.degrees(way_rad):.4g} deg and back with the drive's own position loop, {times} "
             f"time{'s' if times > 1 else ''}",
             f"voltage off where the shaft is {math.degrees(drive.error_limit_rad):.3g} deg behind and comes no nearer",
+            *(foretold.lines(drive.error_limit_rad) if foretold else []),
             "before that it turns by a degree with little current, to see that it does not run away",
             *([] if find is None else ["its profile is found first by slower moves within this way"]),
             *(f"changed for the move: {name} {value:.5g} {_unit(name)}" for name, value in lent.items()),
@@ -149,16 +155,20 @@ def move_command(
         out.warn(line)
     values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]
     values += [{"name": name, "value": value, "unit": _unit(name)} for name, value in gains.items()]
-    peak = math.degrees(found.error_peak_rad)
+    summary = f"following error at most {shown(found.error_peak_rad, 'rad')}"
+    if foretold:
+        values += foretold.rows()
+        summary += f" (predicted: {foretold})"
     run.add(
         Stage(
             "move", "pass", seconds, values=values, files={TRACE: ""}, fallbacks=doubts,
-            summary=f"following error at most {peak:.4g} deg, settling: {shown(found.settling_s, 's')}",
+            summary=f"{summary}, settling: {shown(found.settling_s, 's')}",
         )
     )  # fmt: skip
     told = {} if source is None else _identified(source, trace, drive, run, path, out)
-    data = {"run": run.path, "move": asdict(found), "gains": gains, "lent": lent, "profile": counts, "identified": told}
-    out.result("move", data, lambda: [*_lines(found), *_told(told)])
+    data = {"run": run.path, "move": asdict(found), "gains": gains, "lent": lent, "profile": counts, "identified": told,
+            "predicted": foretold and asdict(foretold)}  # fmt: skip
+    out.result("move", data, lambda: [*_lines(found), *([f"predicted: {foretold}"] if foretold else []), *_told(told)])
     out.note(f"run: {run.path}")
 
 
@@ -214,26 +224,14 @@ def _unit(name: str) -> str:
     return BY_NAME[name].unit
 
 
-def _profile(
-    path: Path | None, i_max_apk: float, speed_rad_s: float | None, acceleration: float | None
-) -> dict[str, float]:
-    """Return the limits that are asked for, by catalogue name; those of a design within the current of the move."""
-    from pmsmtool.axis.design import profile_within
-    from pmsmtool.design.design_file import load_design
-    from pmsmtool.drive.envelope import largest_torque
-    from pmsmtool.errors import ConfigError
+def _asked(limits: Profile | None, speed_rad_s: float | None, acceleration: float | None) -> dict[str, float]:
+    """Return the limits of the move by catalogue name: those of a design, or those that are asked for."""
     from pmsmtool.units import rpm_from_rad_s
 
-    asked = {"speed": speed_rad_s, "acceleration": acceleration, "jerk": None}
-    if path is not None:
-        design = load_design(path)
-        if "axis_speed_rad_s" not in design.facts:
-            raise ConfigError("not a design of an axis", where=str(path), hint="`pmsmtool tune --axis` makes one")
-        within = profile_within(design, largest_torque(design.machine.machine, i_max_apk))
-        asked = {name: value or getattr(within, name) for name, value in asked.items()}
-    rows = {"speed": (_SPEED,), "acceleration": (_UP, _DOWN), "jerk": (_JERK,)}
+    given = (speed_rad_s, acceleration, None) if limits is None else (limits.speed, limits.acceleration, limits.jerk)
+    rows = ((_SPEED,), (_UP, _DOWN), (_JERK,))
     return {
-        row: rpm_from_rad_s(value) for name, value in asked.items() if value is not None for row in rows[name]
+        name: rpm_from_rad_s(value) for value, names in zip(given, rows, strict=True) if value for name in names
     }  # fmt: skip
 
 

@@ -13,6 +13,7 @@ import pytest
 from benchmarks.axis_loads import loaded
 from pmsmtool.axis.design import (
     CASCADE,
+    LOOSEST,
     PID,
     SPEED,
     AxisDrive,
@@ -22,7 +23,7 @@ from pmsmtool.axis.design import (
     axis_path,
     cases,
     from_pid,
-    move_error_rad,
+    move_peaks,
     profile_within,
     with_axis,
 )
@@ -49,7 +50,7 @@ from pmsmtool.flash.journal import Entry
 from pmsmtool.flash.plan import make_plan, names_to_read
 from pmsmtool.flash.restore import snapshot_set
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
-from pmsmtool.machine.two_masses import mechanics_of
+from pmsmtool.machine.two_masses import SWING, mechanics_of
 from pmsmtool.measurement.learned_rows import MeasuredRow, with_measured
 from pmsmtool.params.catalogue import INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
 from pmsmtool.params.parameter_set import ParameterSet
@@ -101,6 +102,21 @@ def test_the_stiffest_gains_touch_a_limit() -> None:
     worst = min(float(facts[f"axis_{loop}_phase_least_deg"]) for loop in ("speed", "position"))
     peak = max(float(facts[f"axis_{loop}_S_peak_db"]) for loop in ("speed", "position"))
     assert 45.0 <= worst < 45.5 or 5.7 < peak <= 6.0
+
+
+def test_a_shaft_with_play_is_no_rigid_one() -> None:
+    """Where pulses swing a shaft of no linear response the gains were those of one mass: 8 times as large."""
+    made, drive = designed("epos4", 0.0, 0.0), axis_drive(load_family("epos4"))
+    path, _ = axis_path(made, ASKED, drive, mechanics_of(made.machine))
+    gains = AxisGains(*(float(made.facts[f"axis_{key}"]) for key in ("K_p_nms_per_rad", "K_i_nm_per_rad", "K_v_per_s")))
+    play = replace(made.machine, conditions={**made.machine.conditions, SWING: 150.0})
+    rigid, swinging = (Box(path, cases(source, drive)) for source in (made.machine, play))
+    assert rigid.may_hold(gains, Limits(44.9, 6.1), ("position",))
+    assert not swinging.may_hold(gains, LOOSEST, ("position",))
+    slower = replace(gains, K_p=0.1 * gains.K_p, K_i=0.01 * gains.K_i, K_v=0.1 * gains.K_v)
+    assert swinging.holds(slower, Limits(), ("position",))
+    swings = {str(case) for case in swinging.cases if case.shaft is not None}
+    assert any("swinging at 225 Hz" in case for case in swings), swings
 
 
 def test_a_drive_that_feeds_no_speed_forward_follows_closer() -> None:
@@ -244,7 +260,7 @@ def test_stored_gains_are_kept_with_the_margins_asked_for_alone() -> None:
     again = beside(replace(made.position, K_p=made.position.K_p * (1.0 + 1e-4)))
     assert again.facts["axis_stored_gains"] == "as designed" and not any("worse" in note for note in again.notes)
     path, plant, move = made.box.path, made.box.plant, plan(3.0, Profile(100.0, 1000.0))
-    lags = [move_error_rad(path, plant, made.position, move, {CASCADE[1]: fed}, 0.0) for fed in (0.0, 1.0)]
+    lags = [move_peaks(path, plant, made.position, move, {CASCADE[1]: fed}, 0.0)[0] for fed in (0.0, 1.0)]
     assert lags[0] > 3.0 * lags[1], "the lag is speed over K_v"
 
 

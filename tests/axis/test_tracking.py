@@ -52,7 +52,10 @@ def stepped(path: AxisPath, share: float) -> np.ndarray:
 def test_prediction_is_the_loop_stepped_sample_by_sample(structure: Structure) -> None:
     path = AxisPath(Mechanics(0.015, 0.002, 25.0, 90.0, 0.02), CURRENT, 1, late=1, structure=structure)
     plain, added = following_error(lifted(path), path, GAINS, MOVE)
-    ours, theirs = plain + SHARE * added, stepped(path, SHARE)
+    ours, theirs = (plain + SHARE * added)[0], stepped(path, SHARE)
     assert np.max(np.abs(ours - ours.mean() - theirs + theirs.mean())) < AGREES_RAD
     share, peak = best_share(plain, added)
-    assert share > 0.8 and peak < 0.1 * np.max(np.abs(plain))
+    assert share > 0.8 and peak < 0.1 * np.max(np.abs(plain[0]))
+    # the load swings behind this ramp: measured 1.06 of J a
+    needed = path.shaft.J * float(np.max(np.abs(MOVE.at(np.linspace(0.0, MOVE.duration_s, 400))[2])))
+    assert needed < np.max(np.abs((plain + added)[1])) < 2.0 * needed
