@@ -342,7 +342,7 @@ def _scalar_rows(
     lacking = drive_map.not_written(wanted.values)
     for name, value in wanted.values.items():
         row, cell = BY_NAME[name], drive_map.cells.get(name)
-        if cell is None:
+        if cell is None or name not in encoded:
             yield name, _number(value), row.unit, "", "", "", "", row.meaning, lacking[name]
         else:
             where = f"0x{cell.index:04X}:{cell.sub:02X}"

@@ -24,6 +24,7 @@ from pmsmtool.design.design_file import Design, DesignValue, design_text, load_d
 from pmsmtool.design.tune import tune
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap, reference_map
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map
+from pmsmtool.drive_maps.shipped_maps import family_names
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import data_folder
 from pmsmtool.firmware.export_c import FLAGS
@@ -179,6 +180,16 @@ def test_csv_through_another_drives_map(folder: Path, tmp_path: Path) -> None:
     outcome = CliRunner().invoke(cli, ["export", "csv", str(folder), "--map", str(tmp_path / "map.toml"), "-v"])
     every = outcome.stderr.splitlines()[1].removeprefix("no object for ").split(", ")
     assert f" {len(every)} of {len(every) + len(cells)} parameters" in warning and "polar.V_ref_ratio" in every
+
+
+@pytest.mark.parametrize("family", [name for name in family_names() if name != "cia402"])
+def test_csv_for_every_family(family: str, folder: Path) -> None:
+    """A gain in amperes of a torque constant that the set lacks ended as an internal error, exit 70."""
+    outcome = CliRunner().invoke(cli, ["export", "csv", str(folder), "--map", family])
+    assert outcome.exit_code == 0, outcome.exception
+    rows = list(csv.DictReader(io.StringIO(outcome.stdout)))
+    told = {row["name"]: bool(row["object"]) != bool(row["not written because"]) for row in rows}
+    assert [name for name, once in told.items() if not once and "[" not in name] == []
 
 
 @pytest.mark.chain
