@@ -321,9 +321,10 @@ def format_estimate(value: float, std: float, unit: str) -> str:
 
     A deviation of zero is written ``(exact)``, one that is not finite ``(deviation unknown)``.
     """
-    factor, text = _scaled(value, unit)
+    known = math.isfinite(value) and math.isfinite(std)
+    factor, text = _scaled(max(abs(value), std) if known else value, unit)  # 0 +- 4 us
     tail = f" {text}" if text else ""
-    if not math.isfinite(value) or not math.isfinite(std) or std < 0.0:
+    if not known or std < 0.0:
         return f"{value / factor:.4g}{tail} (deviation unknown)"
     if std == 0.0:
         return f"{value / factor:.6g}{tail} (exact)"

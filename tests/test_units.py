@@ -145,7 +145,10 @@ def test_units_of_catalogue_and_files_exist(symbol):
         (0.41, 0.00097, "Wb", "0.4100 +- 0.0010 Wb"),
         (3.0, 0.0, "1", "3 (exact)"),
         (5.0, math.nan, "V", "5 V (deviation unknown)"),
-        (0.0, 0.01, "rad", "0.000 +- 0.010 rad"),
+        (0.0, 0.01, "rad", "0 +- 10 mrad"),
+        (0.0, 4e-6, "s", "0 +- 4 us"),
+        (2e-8, 4e-6, "s", "0 +- 4 us"),
+        (-1e-4, 1.6e-3, "rad", "-0.1 +- 1.6 mrad"),
     ],
 )
 def test_estimates_show_what_is_known(value, std, unit, text):
