@@ -125,7 +125,7 @@ def read_text(path: Path, *, largest: int = TEXT_BYTES, encoding: str = "utf-8",
             f"cannot be read as text: byte {error.start + 1} is not {encoding.upper()}",
             where=str(path),
             likely="an editor saved it in another encoding (UTF-16, Windows-1252), or it is no text",
-            hint="save it as UTF-8",
+            hint="give the file that is due here, saved as UTF-8",
         ) from None
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text
 

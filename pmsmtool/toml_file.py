@@ -38,9 +38,9 @@ def parse_toml(text: str, *, where: str) -> dict[str, Any]:
     try:
         tables = tomllib.loads(text.removeprefix("\ufeff"))  # Windows editors begin UTF-8 with this mark
     except (ValueError, RecursionError) as error:  # beside its own error: numbers of 5000 digits, brackets 1000 deep
-        raise ConfigError(
-            f"the file is not TOML: {error}", where=where, likely="a missing quote or bracket, or a decimal comma"
-        ) from None
+        likely = "a missing quote or bracket, or a decimal comma"
+        likely = "it is JSON, as a backup or the record of a run" if text.lstrip().startswith("{") else likely
+        raise ConfigError(f"the file is not TOML: {error}", where=where, likely=likely) from None
     for name, number in _whole_numbers(tables, ""):
         if not -LARGEST_WHOLE <= number < LARGEST_WHOLE:
             raise ConfigError("is a whole number beyond the 64 bit of TOML", where=f"{where}:{name}")

@@ -173,9 +173,10 @@ def _lines(report: MarginReport, simulated: SimulatedMargins | None) -> Iterator
             yield f"worst {spread.name}: {spread.worst_cell or 'rated torque'}, {_sample(spread.worst_sample)}"
     if report.cells:
         yield ""
+        yield "cells where machines of the box need more than the limit, and how many do"
         yield from table(
-            ("cell beyond a limit", "voltage %", "current %"),
-            [(risk.cell, f"{100.0 * risk.voltage:.3g}", f"{100.0 * risk.current:.3g}") for risk in report.cells],
+            ("cell", "voltage", "current"),
+            [(risk.cell, f"{100.0 * risk.voltage:.3g} %", f"{100.0 * risk.current:.3g} %") for risk in report.cells],
         )
     if report.unreachable:
         yield ""

@@ -17,7 +17,7 @@ from pmsmtool.drive_maps.sheet_check import family_of_sheet, other_identity, unn
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.files import read_bytes, read_text
 from pmsmtool.machine.machine_file import SCHEMA as MACHINE_SCHEMA
-from pmsmtool.machine.machine_file import profile_names
+from pmsmtool.machine.machine_file import no_design, profile_names
 from pmsmtool.params import parameter_set
 from pmsmtool.params.parameter_set import ParameterSet, parse_parameter_set
 from pmsmtool.toml_file import parse_toml, refuse_schema
@@ -62,7 +62,7 @@ def load_parameters(path: str | Path, drive_map: DriveMap | None = None) -> Para
         if design.request.get("axis"):  # the rest of the drive stays as it is
             return axis_parameters(design)
         return _for_drive(design.parameter_set(), drive_map)
-    advice = _tune_first(str(path)) if schema == MACHINE_SCHEMA else {"hint": AS_TUNE_WRITES}
+    advice = no_design(schema, str(path), AS_TUNE_WRITES)
     refuse_schema(schema, design_file.SCHEMA, parameter_set.SCHEMA, where=str(path), **advice)
     return _for_drive(parse_parameter_set(text, str(path)), drive_map)
 
@@ -75,14 +75,9 @@ def _for_drive(found: ParameterSet, drive_map: DriveMap | None) -> ParameterSet:
     return replace(found, values={**found.values, **gains}, provenance=provenance)
 
 
-def _tune_first(machine: str) -> dict[str, str]:
-    """Return cause and next step of a machine that was given where a design is due."""
-    return {"likely": "a machine has no gains yet", "hint": f"`pmsmtool tune {machine} -o design.toml` designs them"}
-
-
 def _file(path: Path) -> Path:
     if not path.exists() and str(path) in profile_names():
-        raise ConfigError("is a profile, no design", where=str(path), **_tune_first(str(path)))
+        raise ConfigError("is a profile, no design", where=str(path), **no_design(MACHINE_SCHEMA, str(path)))
     if not path.is_dir():
         return path
     found = next((path / name for name in _IN_A_RUN if (path / name).is_file()), None)

@@ -22,6 +22,7 @@ from pmsmtool.machine.machine_file import (
     machine_from_tables,
     machine_path,
     machine_tables,
+    no_design,
 )
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, EVERY
 from pmsmtool.params.parameter_set import TABLE_NAMES, ParameterSet
@@ -204,7 +205,8 @@ def parse_design(text: str, *, where: str = "design.toml") -> Design:
     design.
     """
     tables = parse_toml(text, where=where)
-    refuse_schema(tables.get("schema"), SCHEMA, where=where, hint="give a design as `tune` writes it")
+    schema = tables.get("schema")
+    refuse_schema(schema, SCHEMA, where=where, **no_design(schema, where, "give a design as `tune` writes it"))
     machine_part = tables.get("machine_file")
     if not isinstance(machine_part, dict):
         raise ConfigError("the table [machine_file] is missing", where=where)

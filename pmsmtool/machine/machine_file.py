@@ -173,9 +173,16 @@ def parse_machine(text: str, *, where: str = "machine file", folder: Path | None
         Where relative file names start; None refuses files beside the text.
     """
     tables = parse_toml(text, where=where)
-    hint = f'a machine file starts with schema = "{SCHEMA}"'
+    hint = f'give a machine file: one that begins with schema = "{SCHEMA}"'
     refuse_schema(tables.pop("schema", None), SCHEMA, where=where, hint=hint)
     return machine_from_tables(tables, where=where, folder=folder, lines=toml_lines(text))
+
+
+def no_design(schema: object, path: str, hint: str = "") -> dict[str, str]:
+    """Return cause and next step of a file that was given where a design is due; ``hint`` where it is no machine."""
+    if schema != SCHEMA:
+        return {"hint": hint}
+    return {"likely": "a machine has no gains yet", "hint": f"`pmsmtool tune {path} -o design.toml` designs them"}
 
 
 @next_step(NEXT_STEP)

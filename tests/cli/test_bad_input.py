@@ -109,6 +109,11 @@ def test_all_that_is_wrong_is_listed_with_its_line(folder: Path, capsys: pytest.
     assert "5 things are wrong" in message  # and f_s_hz is missing
 
 
+def test_a_machine_where_a_design_is_due_is_to_be_tuned(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in ("margins machine.toml", "export c machine.toml -o c", "prove machine.toml --sim interior-2k2"):
+        assert "`pmsmtool tune machine.toml -o design.toml` designs them" in told(2, command, capsys)
+
+
 # ---- the flux map ------------------------------------------------------------------------------------------------
 
 
