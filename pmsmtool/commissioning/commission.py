@@ -259,9 +259,9 @@ class Commissioning:
 
     def _carry_out(self, name: str, number: int) -> None:
         clock = self.drive.node.connection.clock
-        self.progress.begin(name, number, len(STAGES))
         start = clock.now()
         try:
+            self.progress.begin(name, number, len(STAGES))
             stage = replace(self._steps()[name](), seconds=clock.now() - start)
             if name == "identify":
                 stage = self._compared(self._without_map(stage))

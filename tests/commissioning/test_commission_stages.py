@@ -222,6 +222,19 @@ def test_a_chain_that_ended_goes_on_where_it_ended(
     assert run.read().account["state"] == "complete"
 
 
+def test_an_interruption_while_the_stage_is_announced_is_its_end(tmp_path: Path, drive: CanopenDrive) -> None:
+    """Its end was not recorded: the report said "begun, and its end was not recorded"."""
+
+    class Announcing(Noted):
+        def begin(self, name: str, number: int, count: int) -> None:
+            raise KeyboardInterrupt
+
+    run = identified(tmp_path, drive)
+    with pytest.raises(Interrupted):
+        Commissioning(run, drive, Told(), Announcing()).carry_out()
+    assert (run.read().stages[-1].name, run.read().stages[-1].status) == ("tune", "interrupted")
+
+
 @pytest.mark.parametrize("lost", ["machine.toml", "design.toml", "lut.npz", "params.toml"])
 def test_a_lost_file_has_its_stage_and_all_later_ones_run_again(
     lost: str, ended: tuple[RunDirectory, CanopenDrive]
