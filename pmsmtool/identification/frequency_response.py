@@ -177,7 +177,7 @@ def save_response(run: RunDirectory, result: FrequencyResponse | None) -> dict[s
 def response_summary(result: FrequencyResponse | None, refused: IdentificationError | None = None) -> str:
     """Return what a person reads of the response behind the other values, or why it was refused."""
     if result is None:
-        return "" if refused is None else f"; frequency response refused: {refused.reason}: {refused.what}"
+        return "" if refused is None else f"; frequency response refused: {refused.what}"
     return f"; frequency response: {result.reason.partition(':')[0]}"
 
 

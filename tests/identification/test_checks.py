@@ -46,6 +46,6 @@ def test_why_a_frequency_response_was_refused_is_in_the_line_of_the_stage() -> N
     bare = Evaluation(Noise(0.01, 0.0, 0.0))
     without = replace(bare, refused={"frf": refused})
     said = summary_of(without, {}, ("R", "L", "psi"))
-    assert said == f"frequency response refused: E_COHERENCE: {refused.what}"
+    assert said == f"frequency response refused: {refused.what}" and said.count("E_COHERENCE") == 1
     assert summary_of(without, {}, ("R", "frf")) == "", "the verdict on what was asked for says it"
     assert summary_of(bare, {}, ("R",)) == ""
