@@ -203,4 +203,4 @@ def map_command(
         out.note(f"wrote {path}")
     if not report.ok:
         bad = [finding.name for finding in report.findings if not finding.ok]
-        raise CheckFailed(f"not good: {', '.join(bad)}", where=str(source), hint="see the options that repair")
+        raise CheckFailed(", ".join(bad), where=str(source), hint="`pmsmtool machine map --help` lists what repairs it")

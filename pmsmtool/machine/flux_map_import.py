@@ -46,6 +46,7 @@ _NAMES: dict[str, tuple[str, ...]] = {
     "i_complex": ("isdq", "idq", "iscomplex"),
     "psi_complex": ("psisdq", "psidq", "psiscomplex"),
 }
+_FILL = "cut the map, or fill them: `pmsmtool machine map FILE --fill-holes -o whole.npz`"
 _CSV_HEADER = ("i_d_a", "i_q_a", "psi_d_wb", "psi_q_wb")
 
 
@@ -79,7 +80,7 @@ def load_flux_map(path: Path, *, fill: bool = False) -> FluxMap:
     grid = raw.grid
     if grid.holes.any():
         if not fill:
-            raise ConfigError(grid.holes_text(), where=str(path), hint="read it with holes filled, or cut the map")
+            raise ConfigError(grid.holes_text(), where=str(path), hint=_FILL)
         grid, text = fill_holes(grid)
         meta["repairs"] = [*meta.get("repairs", []), text]
     if raw.notes:
@@ -321,7 +322,9 @@ def _csv_points(rows: list[tuple[int, list[str]]], order: Sequence[int], where: 
         for m, column in enumerate(order):
             cell = row[column].strip() if column < len(row) else ""
             if not _is_number(cell) and cell.lower() not in ("", "nan"):
-                raise ConfigError(f"{cell!r} in {_CSV_HEADER[m]} is not a number", where=f"{where}:{number}")
+                likely = "a decimal comma" if "," in cell else ""
+                what = f"{cell!r} in {_CSV_HEADER[m]} is not a number"
+                raise ConfigError(what, where=f"{where}:{number}", likely=likely)
             if cell == "" and (m < 2 or column >= len(row)):
                 raise ConfigError(
                     f"the row ends before {_CSV_HEADER[m]}", where=f"{where}:{number}", likely="a truncated file"
