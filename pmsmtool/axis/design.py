@@ -142,6 +142,8 @@ class AxisDrive:
         Whether its gains are in amperes.
     holds_torque : bool
         Whether it holds the torque of an ampere itself.
+    torque_nm : float or None
+        What its own limit of the current gives (N m); None: not known.
     """
 
     name: str
@@ -150,6 +152,7 @@ class AxisDrive:
     period_s: float | None = None
     amperes: bool = False
     holds_torque: bool = False
+    torque_nm: float | None = None
 
     @property
     def pid(self) -> bool:
@@ -350,7 +353,13 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
         position = stiffest(box, limits, notch=notch, loops=("position",))
     else:
         speed = position = stiffest(box, limits, notch=notch, fed=drive.feeds(CASCADE[1]))
-    profile = profile_of(design, shaft, position, path.T)
+    torque = ratings_of(design).tau_max_nm
+    if drive.torque_nm is not None and drive.torque_nm < torque:
+        share, torque = drive.torque_nm / torque, drive.torque_nm
+        notes = (*notes, f"the drive's own current limit gives {share:.3g} of the largest torque: the move is for that")
+    elif drive.torque_nm is None and not drive.own_core:
+        notes = (*notes, "the drive's own current limit is not known (--stored): the move is for that of the machine")
+    profile = profile_of(design, shaft, position, path.T, torque)
     unknown = [case.shaft.resonance_hz for case in box.cases if case.shaft is not None]
     if unknown:
         swings = f"the shaft has play, or is not rigid: it may swing from {min(unknown):.3g} to {max(unknown):.3g} Hz"
@@ -366,6 +375,7 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
         "axis_structure": path.structure,
         "axis_loop_period_s": path.T,
         "axis_load_ratio": shaft.load_ratio,
+        "axis_torque_nm": torque,
         "axis_speed_rad_s": profile.speed,
         "axis_acceleration_rad_s2": profile.acceleration,
         "axis_jerk_rad_s3": profile.jerk,
@@ -487,12 +497,14 @@ def _half_width(source: MachineFile, key: str, value: float, otherwise: float) -
     return (NORMAL_95 * source.std[key] + source.systematic.get(key, 0.0)) / value
 
 
-def profile_of(design: Design, shaft: Mechanics, gains: AxisGains, T: float) -> Profile:
-    """Return the limits of a move that torque and voltage allow, and that leaves the load at rest."""
+def profile_of(design: Design, shaft: Mechanics, gains: AxisGains, T: float, torque_nm: float) -> Profile:
+    """Return the limits of a move that a torque and the voltage allow, and that leaves the load at rest."""
     source, rated = design.machine, ratings_of(design)
     top_rpm = min(rated.n_max_rpm, rated.base_speed_rpm) if rated.base_speed_rpm > 0.0 else rated.n_max_rpm
-    speed = SPEED_SHARE * rad_s_from_rpm(top_rpm)
-    torque = TORQUE_SHARE * _beyond_friction(rated.tau_max_nm, source, speed)
+    speed, B = SPEED_SHARE * rad_s_from_rpm(top_rpm), source.machine.B_nms or 0.0
+    if torque_nm < rated.tau_max_nm and B:  # half of a low limit is left to accelerate
+        speed = min(speed, 0.5 * _beyond_friction(torque_nm, source, 0.0) / B)
+    torque = TORQUE_SHARE * _beyond_friction(torque_nm, source, speed)
     ramp = 1.0 / shaft.antiresonance_hz if shaft.elastic else RAMP * shaft.J / gains.K_p
     return jerk_limited(speed, torque / shaft.J, math.ceil(ramp / T) * T)
 
@@ -508,7 +520,7 @@ def profile_within(design: Design, torque_nm: float) -> Profile:
     speed, acceleration, jerk = (
         float(facts[f"axis_{name}"]) for name in ("speed_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
     )
-    most = ratings_of(design).tau_max_nm
+    most = float(facts.get("axis_torque_nm", ratings_of(design).tau_max_nm))  # as of earlier versions: the largest
     given, whole = (_beyond_friction(torque, source, speed) for torque in (min(torque_nm, most), most))
     return Profile(speed, acceleration * given / whole, jerk * given / whole)
 

@@ -189,10 +189,10 @@ def _refuse_without_axis(axis: dict[str, Any]) -> None:
             raise ConfigError(f"--{name.replace('_', '-')}: for the loops of --axis", hint="add --axis")
 
 
-def _stored(path: Path | None, drive_map: DriveMap, source: MachineFile) -> dict[str, float] | None:
-    """Return what a backup of the drive holds, by catalogue name."""
+def _stored(path: Path | None, drive_map: DriveMap, source: MachineFile) -> tuple[Any, float | None]:
+    """Return what a backup of the drive holds, by catalogue name, and the limit of its current (A peak)."""
     if path is None:
-        return None
+        return None, None
     from pmsmtool.commissioning.axis_design import own_torque
     from pmsmtool.flash.journal import read_snapshot
     from pmsmtool.flash.restore import snapshot_set
@@ -203,7 +203,8 @@ def _stored(path: Path | None, drive_map: DriveMap, source: MachineFile) -> dict
             f"the backup is not of a drive of the map {drive_map.name!r}", where=str(path),
             hint="`pmsmtool backup --map NAME` of the drive that is tuned makes one",
         )  # fmt: skip
-    return dict(snapshot_set(drive_map, snapshot.entries, own_torque(source, drive_map)).values)
+    held = snapshot_set(drive_map, snapshot.entries, own_torque(source, drive_map))
+    return held.values, snapshot.current_limit_apk
 
 
 def _axis(
@@ -222,7 +223,7 @@ def _axis(
     if bandwidth_hz is not None:
         asked["bandwidth_hz"] = bandwidth_hz
     request = AxisRequest(axis["axis_phase_margin_deg"], axis["axis_peak_db"], axis["loop_rate_hz"], filter_hz)
-    design = design_axis(source, TuneRequest(**asked), request, drive_map, _stored(axis["stored"], drive_map, source))
+    design = design_axis(source, TuneRequest(**asked), request, drive_map, *_stored(axis["stored"], drive_map, source))
     params = axis_parameters(design)
     write_file(path, design_text(design))
     write_file(params_path, params.to_toml())

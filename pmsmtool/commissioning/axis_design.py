@@ -35,6 +35,7 @@ from pmsmtool.design.loops.open_loops import (
 )
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive.envelope import largest_torque
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
@@ -139,13 +140,18 @@ def design_axis(
     axis: AxisRequest,
     drive_map: DriveMap,
     stored: Mapping[str, float] | None = None,
+    limit_apk: float | None = None,
 ) -> Design:
     """Design the axis of a machine on a drive; what it holds is kept where that follows better with enough margin.
 
     Raises ConfigError: the machine file has no inertia, or gains do not fit the drive's types; DesignInfeasible: no
     gains keep the margins over the tolerance box.
+
+    ``limit_apk``: the drive's own limit of its current (A peak), where that is known.
     """
     drive = axis_drive(drive_map)
+    if limit_apk is not None:
+        drive = replace(drive, torque_nm=largest_torque(source.machine, limit_apk))
     made = with_axis(tune(source, request), axis, drive)
     if stored is not None:
         made = at_least_as_good(made, stored, drive)

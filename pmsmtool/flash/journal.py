@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import re
 from collections.abc import Iterator, Sequence
@@ -79,6 +80,8 @@ class Snapshot:
         Content hash of the set that was written; empty in a backup.
     entries : tuple of Entry
         Parameters in writing order, then the marks.
+    current_limit_apk : float or None
+        Smallest limit of the current that the drive held (A peak); None where none of known unit was seen.
     """
 
     kind: Kind
@@ -87,6 +90,7 @@ class Snapshot:
     signature: int
     content: str
     entries: tuple[Entry, ...]
+    current_limit_apk: float | None = None
 
     def with_state(self, state: State) -> Snapshot:
         """Return the snapshot in another state."""
@@ -113,6 +117,7 @@ class Snapshot:
             "node": self.identity.node,
             "signature": self.signature,
             "content": self.content,
+            **({} if self.current_limit_apk is None else {"current_limit_apk": self.current_limit_apk}),
             "entries": entries,
         }
 
@@ -153,8 +158,9 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
     if wrong:
         raise DamagedSnapshot("not a snapshot", where=where, violations=wrong)
     return Snapshot(
-        head["kind"], head["state"], Identity(node=head["node"], **who), head["signature"], head["content"], entries
-    )
+        head["kind"], head["state"], Identity(node=head["node"], **who), head["signature"], head["content"], entries,
+        head.get("current_limit_apk"),
+    )  # fmt: skip
 
 
 @next_step(NEXT_STEP)
@@ -195,6 +201,7 @@ _HEAD: tuple[Key, ...] = (
     _whole("node", 127, "node of the drive"),
     _whole("signature", _WORD, "layout of its parameter set"),
     _required("content", "content hash of the set"),
+    Key("", "current_limit_apk", "float", "A", 0, math.inf, None, "smallest limit of the current"),
 )
 _IDENTITY: tuple[Key, ...] = (
     *(_whole(name, _WORD, "object 0x1018") for name in ("vendor", "product", "revision")),

@@ -10,10 +10,11 @@ from dataclasses import replace
 
 from pmsmtool.bus.sdo import Mode
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.motion_objects import held_current_limits, rated_apk
 from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap, address_in
-from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
+from pmsmtool.errors import ConfigError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.flash.download import Outcome
 from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
 from pmsmtool.flash.map_gate import contradictions
@@ -97,7 +98,17 @@ def take_backup(node: DriveNode, identity: Identity, *, progress: Progress = lam
         except SdoAbort:
             continue  # the drive does not keep this mark
     content = snapshot_set(node.map, entries).content_hash()
-    return Snapshot("backup", "done", identity, node.map.signature, content, tuple(entries))
+    limit = None if node.map.staging else _current_limit(node)
+    return Snapshot("backup", "done", identity, node.map.signature, content, tuple(entries), limit)
+
+
+def _current_limit(node: DriveNode) -> float | None:
+    """Return the smallest limit of the current that a drive holds (A peak); None where its unit is not known."""
+    try:
+        held = held_current_limits(node, rated_apk(node))
+    except NotAvailable:
+        return None
+    return min((apk for _, apk in held if 0.0 < apk < math.inf), default=None)
 
 
 def snapshot_set(

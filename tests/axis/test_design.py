@@ -24,6 +24,7 @@ from pmsmtool.axis.design import (
     cases,
     from_pid,
     move_peaks,
+    profile_of,
     profile_within,
     with_axis,
 )
@@ -41,6 +42,7 @@ from pmsmtool.commissioning.axis_design import (
 )
 from pmsmtool.design.design_file import Design, design_text, parse_design
 from pmsmtool.design.loops.speed_loop import Notch
+from pmsmtool.design.ratings import ratings_of
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.envelope import largest_torque
@@ -277,6 +279,25 @@ def test_a_move_keeps_within_what_a_smaller_current_gives() -> None:
     assert within.acceleration / within.jerk == pytest.approx(whole.acceleration / whole.jerk), "ramps of the same time"
     with pytest.raises(DesignInfeasible, match="friction takes"):
         profile_within(made, friction)
+
+
+def test_a_low_limit_of_the_drive_makes_the_move_calmer() -> None:
+    """A drive that gives a tenth of I_max was designed a move for all of it, which its current cannot follow."""
+    source, motor = tune(machine(), TuneRequest()), machine().machine
+    torque = 0.1 * largest_torque(motor, motor.I_max_apk or 0.0)
+    shaft, gains = mechanics_of(machine()), AxisGains(1.0, 10.0, 10.0)
+    whole = ratings_of(source).tau_max_nm
+    low, most = (profile_of(source, shaft, gains, 1e-3, limit) for limit in (torque, whole))
+    needed = (motor.J_kgm2 or 0.0) * low.acceleration + (motor.tau_c_nm or 0.0) + (motor.B_nms or 0.0) * low.speed
+    assert needed < torque < (motor.J_kgm2 or 0.0) * most.acceleration
+    made = replace(source, facts={**source.facts, "axis_torque_nm": torque} | {
+        f"axis_{name}": value for name, value in
+        (("speed_rad_s", low.speed), ("acceleration_rad_s2", low.acceleration), ("jerk_rad_s3", low.jerk))
+    })  # fmt: skip
+    assert profile_within(made, whole).acceleration == pytest.approx(low.acceleration), (
+        "no more than it was planned for"
+    )
+    assert profile_within(made, 0.5 * torque).acceleration < 0.5 * low.acceleration
 
 
 def test_a_gain_per_increment_follows_the_increments_that_the_drive_holds() -> None:

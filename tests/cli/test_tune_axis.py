@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from pmsmtool.flash.journal import read_snapshot, write_snapshot
 from tests.cli.conftest import Tool
 
 DRIVE = ("--map", "epos4", "--sim", "interior-2k2?drive=epos4&nv=axis.nv")
@@ -31,8 +33,15 @@ def test_gains_of_the_axis_reach_the_drive(tool: Tool, tmp_path: Path) -> None:
     # what the drive holds now is as good as what is designed, and the factory's gains are worse
     assert tool("backup", "-o", "stored.json", *DRIVE)[0] == 0
     again = ("tune", "interior-2k2", "-o", "again.toml", "--axis", "--stored", "stored.json", "--json", "--map")
-    code, printed, _ = tool(*again, "epos4")
+    code, printed, said = tool(*again, "epos4")
     facts = json.loads(printed)["facts"]
+    assert facts["axis_stored_gains"] == "as designed" and "holds the designed gains already" in said
+    snapshot = read_snapshot(Path("stored.json"))
+    assert snapshot.current_limit_apk is not None and "current limit is not known" not in said
+    write_snapshot(Path("low.json"), replace(snapshot, current_limit_apk=1.2))
+    code, printed, said = tool(*(word.replace("stored.json", "low.json") for word in again), "epos4")
+    low = json.loads(printed)["facts"]
+    assert low["axis_acceleration_rad_s2"] < 0.2 * facts["axis_acceleration_rad_s2"] and "the move is for that" in said
     assert code == 0 and facts["axis_stored_error_rad"] == pytest.approx(facts["axis_error_rad"], rel=0.05)
     code, _, said = tool(*again, "ingenia")
     assert code == 2 and "not of a drive of the map" in said
