@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +16,10 @@ from pmsmtool.plain_text import by_reason
 
 if TYPE_CHECKING:
     from pmsmtool.measurement.capabilities import Capabilities, Row
+
+
+OF_AXIS = "by a set of `tune --axis`"
+"""Said of a value that no other set writes (``drive_maps.drive_map.NOT_ALONE``)."""
 
 
 @click.command(
@@ -42,7 +45,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
     With --eds no bus is needed: a simulated drive with the objects of the file is read, with a motor set up in it.
     """
     from pmsmtool.drive_maps.shipped_maps import GENERIC, kin_of
-    from pmsmtool.flash.map_gate import contradictions, other_drive, unknown_firmware
+    from pmsmtool.flash.map_gate import other_drive, unknown_firmware
     from pmsmtool.measurement.capabilities import examine
     from pmsmtool.params.catalogue import BY_NAME
     from pmsmtool.sim.foreign.drive import assumptions_of
@@ -52,9 +55,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
         bus = rehearsal_bus(bus, eds=eds)
     with open_node(bus, within_s=LOOKING_S) as node:
         found = examine(node, given)
-        own = not found.drive_map.staging  # the reference drive shows the layout of its set
-        denied = contradictions(node, found.drive_map.cells) if own else {}
-    out.result("caps", _facts(found, denied), lambda: _lines(found, denied, out.verbosity > 0, asked=eds is None))
+    out.result("caps", _facts(found), lambda: _lines(found, out.verbosity > 0, asked=eds is None))
     for name, why in found.drive_map.not_written(BY_NAME).items():
         if name not in found.drive_map.left_out:
             out.detail(f"not written: {name}: {why}")
@@ -74,7 +75,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
         out.warn(firmware)
 
 
-def _facts(found: Capabilities, denied: Mapping[str, str]) -> dict[str, Any]:
+def _facts(found: Capabilities) -> dict[str, Any]:
     from pmsmtool.drive_maps.drive_map_file import map_hash
     from pmsmtool.params.catalogue import BY_NAME
 
@@ -91,8 +92,8 @@ def _facts(found: Capabilities, denied: Mapping[str, str]) -> dict[str, Any]:
         "quantities": [_row_facts(row) for row in found.rows()],
         "parameters": sorted(found.drive_map.cells),
         "left_out": dict(found.drive_map.left_out),
-        "written": {name: found.drive_map.row_text(name) for name in _written(found, denied)},
-        "not_written": {**found.drive_map.not_written(BY_NAME), **_unwritten(found, denied)},
+        "written": {name: found.drive_map.row_text(name) for name in _written(found)},
+        "not_written": {**found.drive_map.not_written(BY_NAME), **_unwritten(found)},
     }
 
 
@@ -107,32 +108,33 @@ def _row_facts(row: Row) -> dict[str, Any]:
     }
 
 
-def _written(found: Capabilities, denied: Mapping[str, str]) -> list[str]:
-    return [name for name in found.drive_map.cells if name not in _unwritten(found, denied)]
+def _written(found: Capabilities) -> list[str]:
+    return [name for name in found.drive_map.cells if name not in _unwritten(found)]
 
 
-def _unwritten(found: Capabilities, denied: Mapping[str, str]) -> dict[str, str]:
+def _unwritten(found: Capabilities) -> dict[str, str]:
     """Return the mapped parameters that are not written all the same, and why."""
     from pmsmtool.params.catalogue import OWN_SCALES
 
     if not found.map_is_drives:
         return dict.fromkeys(found.drive_map.cells, "this map does not name this drive")
     own = [name for name in found.drive_map.cells if name in OWN_SCALES]
-    return {**denied, **dict.fromkeys(own, "the drive counts gains by it: compared with the machine, never written")}
+    return dict.fromkeys(own, "the drive counts gains by it: compared with the machine, never written")
 
 
-def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bool) -> list[str]:
+def _parameter_lines(found: Capabilities, sources: bool) -> list[str]:
     """Say value by value what `flash-params` writes; what the map does not even name is a number (-v: by name)."""
     from pmsmtool.params.catalogue import BY_NAME
 
     drive_map = found.drive_map
     others = len(drive_map.not_written(BY_NAME).keys() - drive_map.left_out.keys())
-    unwritten = _unwritten(found, denied)
-    sourced = denied if found.map_is_drives else {}
-    reasons = ((drive_map.row_text(n) if sources or n in sourced else n, why) for n, why in unwritten.items())
-    written = {name: drive_map.cells[name] for name in _written(found, denied)}
-    rows = [(f"written: {name}", f"0x{row.index:04X}:{row.sub:02X}", row.wire) for name, row in written.items()]
-    lines = [f"written: {drive_map.row_text(name)}" for name in written] if sources else table(("", "", ""), rows)[1:]
+    reasons = ((drive_map.row_text(n) if sources else n, why) for n, why in _unwritten(found).items())
+    written = {name: drive_map.cells[name] for name in _written(found)}
+    rows = [
+        (f"written: {name}", f"0x{row.index:04X}:{row.sub:02X}", row.wire, OF_AXIS if drive_map.scale_of(row) else "")
+        for name, row in written.items()
+    ]
+    lines = [f"written: {drive_map.row_text(name)}" for name in written] if sources else table([""] * 4, rows)[1:]
     return [
         "",
         "of a set, `flash-params` writes what is listed here as written; nothing is written now",
@@ -143,7 +145,7 @@ def _parameter_lines(found: Capabilities, denied: Mapping[str, str], sources: bo
     ]
 
 
-def _lines(found: Capabilities, denied: Mapping[str, str], sources: bool, *, asked: bool) -> list[str]:
+def _lines(found: Capabilities, sources: bool, *, asked: bool) -> list[str]:
     """Return what a person reads: what is had, then what is missing and for what, then what is written.
 
     ``asked``: a drive was asked; else node and serial number are none.
@@ -172,7 +174,7 @@ def _lines(found: Capabilities, denied: Mapping[str, str], sources: bool, *, ask
         what = "it moves" if "push" in found.features else "`pmsmtool move` moves it"
         lines += ["", f"{what} with --map mine.toml: these lines, numbers of its name plate in place of ?"]
         lines += [f"    {line}" for line in found.map_to_write]
-    return lines if found.drive_map.staging else [*lines, *_parameter_lines(found, denied, sources)]
+    return lines if found.drive_map.staging else [*lines, *_parameter_lines(found, sources)]
 
 
 def _said(row: Row) -> tuple[str, str]:

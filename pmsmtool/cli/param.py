@@ -346,14 +346,12 @@ def _say_staged(node: DriveNode, out: Output) -> None:
 def _device_set(node: DriveNode, out: Output) -> ParameterSet:
     """Return what the drive holds; rows of a family's map that this drive lacks are left out and told."""
     from pmsmtool.drive.parameters import DriveParameters
-    from pmsmtool.flash.map_gate import contradictions
+    from pmsmtool.flash.map_gate import map_on
 
-    cells = node.map.cells
-    lacking = {} if node.map.staging else contradictions(node, cells)
-    for name, why in lacking.items():
-        out.warn(f"left out: {name} 0x{cells[name].index:04X}:{cells[name].sub:02X}: {why}")
-    names = [name for name, cell in cells.items() if not {name, cell.gain} & lacking.keys()]
-    return node.map.decode(DriveParameters(node).read([*names, *node.map.tables]))
+    held = map_on(node)
+    for name in (name for name in node.map.cells if name not in held.cells):
+        out.warn(f"left out: {name}: {held.left_out[name]}")
+    return held.decode(DriveParameters(node).read([*held.cells, *held.tables]))
 
 
 def _without_defaults(held: ParameterSet) -> ParameterSet:

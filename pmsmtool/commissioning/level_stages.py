@@ -286,7 +286,7 @@ class LevelStages:
             return sign
         drive_map = self.found.drive_map
         if not drive_map.cells:
-            return f"needs a map with objects for parameters: {drive_map.name!r} has none"
+            return f"needs a map with objects for parameters: {drive_map.name!r} has none that this drive has"
         if not self.found.map_is_drives:
             return f"needs a map that names this drive's vendor and product (0x1018): {drive_map.name!r} does not"
         try:

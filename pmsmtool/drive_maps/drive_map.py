@@ -12,7 +12,7 @@ import math
 import re
 import struct
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from pmsmtool.data_types import DATA_TYPES
@@ -28,6 +28,7 @@ from pmsmtool.params.catalogue import CATALOGUE, INCREMENTS, OWN_SCALES, TORQUE_
 from pmsmtool.params.parameter_set import SATURATION, TABLE_NAMES, ParameterSet
 from pmsmtool.plain_text import counted
 
+_LOOP_GAIN = re.compile(r"(?<=\.)(K_|pid_)[pid]_.*")
 _ADDRESS = re.compile(r"0x([0-9A-F]{4}):([0-9A-F]{2})(?: |\Z)")
 Rounding = Literal["nearest", "down", "up"]
 Form = Literal["value", "time", "rate", "relative", "torque constant", "current"]
@@ -271,6 +272,8 @@ class DriveMap:
         How the drive's own identification is started and read.
     identity : IdentityRows
         What beyond vendor and product tells whether a drive is the map's.
+    whole : DriveMap or None
+        The map of the file, where this one is without rows that a drive lacks.
     """
 
     name: str
@@ -288,6 +291,7 @@ class DriveMap:
     sources: Mapping[str, str] = field(default_factory=dict)
     vendor_tuning: VendorTuning | None = None
     identity: IdentityRows = field(default_factory=IdentityRows)
+    whole: DriveMap | None = None
 
     @property
     def signature(self) -> int:
@@ -348,6 +352,20 @@ class DriveMap:
             return INCREMENTS
         amperes = cell.form == "current" or (cell.gain in self.cells and self.cells[cell.gain].form == "current")
         return TORQUE_PER_AMPERE if amperes else ""
+
+    def without(self, lacking: Mapping[str, str]) -> DriveMap:
+        """Return the map less rows, named with the reason, and less what acts only with one of them.
+
+        That is what is counted by it, and the other gains of its loop: new ones do not fit the old ones beside them.
+        """
+        gone = dict(lacking)
+        for name, cell in self.cells.items():
+            beside = [other for other in lacking if _LOOP_GAIN.sub("", name) == _LOOP_GAIN.sub("", other)]
+            for base in (cell.gain, self.scale_of(cell), *beside):
+                if base in lacking and name not in lacking:
+                    gone[name] = f"not without {base}, and {lacking[base]}"
+        cells = {name: cell for name, cell in self.cells.items() if name not in gone}
+        return replace(self, cells=cells, left_out={**self.left_out, **gone}, whole=self.whole or self)
 
     def missing(self, wanted: ParameterSet) -> tuple[str, ...]:
         """Return the entries of a set that this drive has no object for."""

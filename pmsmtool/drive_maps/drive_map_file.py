@@ -66,8 +66,12 @@ Complain = Callable[[str, str], None]
 
 
 def map_hash(drive_map: DriveMap) -> str:
-    """Return the content hash of a map: comments, order of the file and what only identifies drives do not count."""
-    return hashlib.sha256(dump_drive_map(replace(drive_map, identity=IdentityRows())).encode("utf-8")).hexdigest()
+    """Return the content hash of a map: comments, order of the file and what only identifies drives do not count.
+
+    Neither does what a drive lacks of it: the hash is that of the file.
+    """
+    whole = replace(drive_map.whole or drive_map, identity=IdentityRows())
+    return hashlib.sha256(dump_drive_map(whole).encode("utf-8")).hexdigest()
 
 
 # ---- writing ----------------------------------------------------------------------------------------

@@ -225,7 +225,7 @@ class Download:
         check_map(self.node.map, self.identity, self.folder)
         if not self.plan.entries:  # storing would keep what others left in it, for nothing
             raise NotAvailable(
-                f"the map {self.node.map.name!r} has no object for any value of the set",
+                f"the map {self.node.map.name!r} has no object of this drive for any value of the set",
                 where=f"node {self.node.node}",
                 hint="enter the values with the maker's software, or write the rows of your manual into a map",
             )

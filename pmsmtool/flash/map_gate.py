@@ -10,11 +10,11 @@ decision, not an accident.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.drive_node import NOT_READ, DriveNode
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.drive_map_file import map_hash
@@ -22,6 +22,7 @@ from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of,
 from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
 from pmsmtool.files import ELSEWHERE, make_folder, read_text, write_file
 from pmsmtool.flash.journal import JournalFolder
+from pmsmtool.plain_text import counted
 
 SHOWN = 12
 """Digits of a hash that a message shows."""
@@ -84,7 +85,7 @@ def check_motion(drive_map: DriveMap, identity: Identity) -> None:
     Raises ConfigError: the map is for another identity, or is no shipped one and says none.
     """
     named = drive_map.vendor != UNKNOWN_VENDOR and drive_map.is_for(*identity.vendor_product)
-    if not named and drive_map != load_family(GENERIC):
+    if not named and (drive_map.whole or drive_map) != load_family(GENERIC):
         raise _other_drive(drive_map, identity)
 
 
@@ -113,20 +114,25 @@ def unknown_firmware(drive_map: DriveMap, identity: Identity) -> str:
     )
 
 
-def contradictions(node: DriveNode, names: Iterable[str]) -> dict[str, str]:
-    """Return the parameters whose object the drive does not have, or has in another size than its map, and which."""
-    wrong = {}
-    for cell in (node.map.cells[name] for name in names):
+def map_on(node: DriveNode) -> DriveMap:
+    """Return a node's map less the rows whose object the drive does not show, or holds in another size, each told.
+
+    The reference drive shows the layout of its set instead.
+    """
+    gone: dict[str, str] = {}
+    for cell in () if node.map.staging else node.map.cells.values():
+        where = f"0x{cell.index:04X}:{cell.sub:02X}"
         try:
             size = len(node.sdo.upload(cell.index, cell.sub).data)
         except SdoAbort as abort:
-            if abort.code not in (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX):
+            if abort.code not in NOT_READ:
                 raise
-            wrong[cell.name] = "the drive has no such object"
+            hidden = "shows nothing in" if abort.code == AbortCode.WRITE_ONLY else "has no object"
+            gone[cell.name] = f"the drive {hidden} {where}"
             continue
         if size != cell.size:
-            wrong[cell.name] = f"the drive holds {size} bytes there"
-    return wrong
+            gone[cell.name] = f"the drive holds {counted(size, 'byte')} in {where}, the map states {cell.wire}"
+    return node.map.without(gone) if gone else node.map
 
 
 def _other_drive(drive_map: DriveMap, identity: Identity) -> ConfigError:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import datetime
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 from pmsmtool.bus.sdo import Mode
@@ -17,12 +17,11 @@ from pmsmtool.drive_maps.drive_map import DriveMap, address_in
 from pmsmtool.errors import ConfigError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.flash.download import Outcome
 from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
-from pmsmtool.flash.map_gate import contradictions
+from pmsmtool.flash.map_gate import map_on
 from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
 from pmsmtool.flash.whole_drive import parameters_of
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import ParameterSet, table_unit
-from pmsmtool.plain_text import counted
 
 CONFIGURATION_EPOCH = datetime.date(1984, 1, 1)
 """Day 0 of object 0x1020:01 (CiA 301, section 7.5.2.21)."""
@@ -54,23 +53,11 @@ def plan_download(node: DriveNode, wanted: ParameterSet) -> Plan:
     """Read what a drive holds and return the plan that brings it to a set; nothing is written.
 
     Raises NotAvailable: the drive's parameter set has another layout than this program's; ConfigError: values out of
-    bounds, or that do not fit the drive's types; rows of the map that the drive contradicts.
+    bounds, or that do not fit the drive's types.
     """
-    parameters, names = _settled(node), names_to_read(node.map, wanted)
-    if not node.map.staging:  # the reference drive shows the layout of its set
-        _refuse_contradictions(node, names)
-    return make_plan(node.map, wanted, parameters.read(names))
-
-
-def _refuse_contradictions(node: DriveNode, names: Sequence[str]) -> None:
-    wrong = contradictions(node, names)
-    if wrong:
-        raise ConfigError(
-            f"the drive contradicts {counted(len(wrong), 'row')} of the map {node.map.name!r}",
-            where=f"node {node.node}", violations=[f"{node.map.row_text(name)}: {why}" for name, why in wrong.items()],
-            likely="another firmware than the map's sources describe",
-            hint="correct the rows in a copy of the map, and give it with --map; nothing was written",
-        )  # fmt: skip
+    parameters = _settled(node)
+    held = map_on(node)
+    return make_plan(held, wanted, parameters.read(names_to_read(held, wanted)))
 
 
 def plan_restore(node: DriveNode, snapshot: Snapshot) -> Plan:
@@ -86,9 +73,15 @@ def _settled(node: DriveNode) -> DriveParameters:
 
 
 def take_backup(node: DriveNode, identity: Identity, *, progress: Progress = lambda done, total: None) -> Snapshot:
-    """Read every parameter, table and mark of a drive."""
+    """Read every parameter, table and mark of a drive. Raises NotAvailable: there is none that its map names."""
     parameters = _settled(node)
-    found = parameters.read([*node.map.cells, *node.map.tables], progress=progress)
+    held = map_on(node)
+    if not (held.cells or held.tables):
+        raise NotAvailable(
+            f"the map {held.name!r} names no parameter that this drive has: there is nothing to save",
+            where=f"node {node.node}", hint="`pmsmtool backup --eds FILE` saves every setting of its maker's file",
+        )  # fmt: skip
+    found = parameters.read([*held.cells, *held.tables], progress=progress)
     entries = [Entry(name, *node.map.address(name), data) for name, data in found.items()]
     for name, index, sub in MARKS:
         if name == "design_id" and not node.map.staging:

@@ -38,6 +38,7 @@ from pmsmtool.drive_maps.motion_objects import blank_map
 from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family
 from pmsmtool.drive_maps.vendor_tuning import OS_COMMAND, OS_COMMAND_MODE
 from pmsmtool.errors import NotAvailable, SdoAbort
+from pmsmtool.flash.map_gate import map_on
 from pmsmtool.identification.request import Method
 from pmsmtool.identification.value_verdict import NOT_TOLD
 from pmsmtool.machine.hall import HallCommutation
@@ -202,7 +203,7 @@ class Capabilities:
     identity : Identity
         Of the drive.
     drive_map : DriveMap
-        The map used.
+        The map used, less the rows that this drive lacks.
     map_is_drives : bool
         Whether that map names this identity; without, nothing is written through it.
     features : frozenset of str
@@ -363,8 +364,9 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     """
     node.map = given or node.map
     identity = node.identity()
-    drive_map = choose_map(identity, given)
-    node.map = drive_map
+    node.map = choose_map(identity, given)
+    named = identity.vendor != UNKNOWN_VENDOR and node.map.is_for(*identity.vendor_product)
+    node.map = drive_map = map_on(node) if named else node.map
     modes = _modes(node)
     has = {
         "heartbeat": node.has(0x1016, 1),
@@ -399,7 +401,6 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
             "encoder": halls < HallCommutation.ALONE,
             "frame": halls < HallCommutation.STEPS,
         }
-    named = identity.vendor != UNKNOWN_VENDOR and drive_map.is_for(*identity.vendor_product)
     found = {name for name, there in has.items() if there}
     if named:  # whatever starts a drive's own identification is not tried on another drive
         found |= {f"vendor {name}" for name in _vendor_quantities(node, drive_map)}

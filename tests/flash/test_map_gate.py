@@ -21,8 +21,8 @@ from pmsmtool.flash.map_gate import (
     check_map,
     check_motion,
     check_nodes,
-    contradictions,
     forget_map,
+    map_on,
     memory_of,
     other_drive,
     remember_map,
@@ -141,11 +141,17 @@ def test_firmware_that_no_source_describes_is_told(drive_map: DriveMap, revision
     assert (told in text) if told else text == ""
 
 
-def test_rows_that_the_drive_contradicts() -> None:
-    names = ["motor.pole_pairs", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as"]
-    with opened({DriveObject(0x3001, 3, "B"): 3, DriveObject(0x30A0, 1, "H"): 1}) as (_, connection):
-        wrong = contradictions(DriveNode(connection, NODE, drive_map=EPOS4), names)
-    assert wrong == {
-        "current.K_p_q_v_per_a": "the drive holds 2 bytes there",
-        "current.K_i_q_v_per_as": "the drive has no such object",
-    }
+def test_rows_that_a_drive_lacks_go_with_what_acts_only_with_them() -> None:
+    """The hash stays that of the file: what is kept of a drive must not depend on what it lacks."""
+    rows = ("motor.pole_pairs", "current.K_p_q_v_per_a", "current.K_i_q_v_per_as", "speed.K_p_nms_per_rad")
+    asked = replace(EPOS4, cells={name: EPOS4.cells[name] for name in (*rows, "reference.K_t_nm_per_a")})
+    there = {DriveObject(0x3001, 3, "B"): 3, DriveObject(0x30A0, 1, "H"): 1, DriveObject(0x30A0, 2, "I"): 1}
+    with opened({**there, DriveObject(0x30A2, 1, "I"): 1}) as (_, connection):
+        held = map_on(DriveNode(connection, NODE, drive_map=asked))
+    assert list(held.cells) == ["motor.pole_pairs"] and map_hash(held) == map_hash(asked)
+    other_size = "the drive holds 2 bytes in 0x30A0:01, the map states UNSIGNED32"
+    no_object = "the drive has no object 0x3001:05"
+    assert held.left_out["current.K_p_q_v_per_a"] == other_size
+    assert held.left_out["current.K_i_q_v_per_as"] == f"not without current.K_p_q_v_per_a, and {other_size}"
+    assert held.left_out["reference.K_t_nm_per_a"] == no_object
+    assert held.left_out["speed.K_p_nms_per_rad"] == f"not without reference.K_t_nm_per_a, and {no_object}"

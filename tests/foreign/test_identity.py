@@ -15,6 +15,7 @@ import pytest
 from pmsmtool.bus.connect import connect
 from pmsmtool.cli.main import run
 from pmsmtool.drive.drive_node import DriveNode, vendor_product_serial
+from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, map_hash, parse_drive_map
 from pmsmtool.drive_maps.identity_rows import IdentityRows
@@ -24,6 +25,7 @@ from pmsmtool.flash.journal import Snapshot, parse_snapshot
 from pmsmtool.flash.map_gate import check_motion, unknown_firmware
 from pmsmtool.flash.restore import plan_download, take_backup
 from pmsmtool.measurement.capabilities import examine
+from pmsmtool.params.catalogue import BY_NAME, OWN_SCALES
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.node.node import Node
 from tests.foreign.data_sheets import COMMON, Row, copley, epos4, identity, write_eds
@@ -180,22 +182,22 @@ def test_it_is_said_before_anything_is_written(
 
 
 @pytest.mark.parametrize("family", SCALING)
-def test_every_row_of_every_map_is_refused_where_the_drive_has_it_otherwise(family: str) -> None:
-    """Each row in turn at an object that is not there, and in a type of another size; all are named at once."""
+def test_every_row_of_every_map_is_left_out_where_the_drive_has_it_otherwise(family: str) -> None:
+    """Each row in turn at an object that is not there, and in a type of another size."""
     drive_map = load_family(family)
     with connect("pmsmsim", f"interior-2k2?nv=:memory:&drive={family}") as connection:
         node = DriveNode(connection, 1)
-        for name, cell in drive_map.cells.items():
+        for name in drive_map.cells.keys() - {*OWN_SCALES}:
+            cell = drive_map.cells[name]
             size = "UNSIGNED16" if cell.size != 2 else "UNSIGNED32"
             for wrong in (replace(cell, index=0x5FF0), replace(cell, wire=size)):
                 node.map = replace(drive_map, cells={**drive_map.cells, name: wrong})
-                base = {} if not cell.gain else {cell.gain: 1.0}
-                with pytest.raises(ConfigError, match="contradicts") as caught:
-                    plan_download(node, ParameterSet({**base, name: 1.0}))
-                said = str(caught.value)
-                assert f"{family} {name} 0x{wrong.index:04X}:{wrong.sub:02X}" in said
-                assert drive_map.sources.get(cell.source, "no source stated") in said
-                assert "nothing was written" in caught.value.hint
+                held = DriveParameters(node).held_value(cell.gain) or 1.0
+                wanted = {name: max(1.0, BY_NAME[name].minimum)} | ({cell.gain: held} if cell.gain else {})
+                plan = plan_download(node, ParameterSet(wanted))
+                assert name not in {entry.name for entry in plan.entries}
+                assert f"0x{wrong.index:04X}:{wrong.sub:02X}" in plan.not_written[name]
+                assert any(line.startswith(f"not written: {name}: the drive h") for line in plan.lines())
         node.close()
 
 

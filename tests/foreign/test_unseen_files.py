@@ -19,6 +19,7 @@ from pmsmtool.drive.motion_objects import POSITION, position_units, rated_apk
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.errors import NotAvailable
 from pmsmtool.machine.machine_file import machine_path
+from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.foreign import families
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.node.dictionary import Entry
@@ -427,7 +428,7 @@ def test_a_row_that_this_drive_of_the_family_lacks_ends_no_dump(tool: Tool) -> N
     write_eds(Path("x.eds"), (*rows, (0x6081, 0, "U32", "rw", "1000")))
     code, said, told = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "param", "dump", "--all")
     assert code == 0 and "profile_speed_rpm = " in said
-    assert "left out: motor.pole_pairs 0x2350:03: the drive has no such object" in told
+    assert "left out: motor.pole_pairs: the drive has no object 0x2350:03" in told
     code, said, _ = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "param", "get", "0x2333:01", "--json")
     held = bytes.fromhex(json.loads(said)["parameters"][0]["bytes"])
     assert code == 0 and int.from_bytes(held, "little") == 6080, "the rehearsed motor's current (mA), 0 before"
@@ -460,3 +461,35 @@ def test_a_further_axis_that_stays_on_is_no_confirmed_stop(tool: Tool, word: str
     write_eds(Path("x.eds"), unknown("0x2D", *axis))
     ended, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "stop")
     assert ended == code and ("axis 2 shows OPERATION ENABLED (0x6841)" in said) == (code == 8)
+
+
+@pytest.mark.chain
+def test_what_caps_says_is_written_is_written_where_the_drive_lacks_another_row(tool: Tool) -> None:
+    """A Faulhaber without a pole number: `flash-params` refused the set, `backup` ended with exit code 4."""
+    rows = tuple(row for row in faulhaber() if row[0] != 0x2350)
+    write_eds(Path("x.eds"), (*rows, (0x6081, 0, "U32", "rw", "1000"), (0x1010, 1, "U32", "rw", "1")))
+    facts = json.loads(tool("caps", "--eds", "x.eds", "--json")[1])
+    assert list(facts["written"]) == ["reference.profile_speed_rpm"]
+    assert facts["not_written"]["motor.pole_pairs"] == "the drive has no object 0x2350:03"
+    wanted = {"motor.pole_pairs": 2.0, "reference.profile_speed_rpm": 700.0}
+    Path("set.toml").write_text(ParameterSet(wanted).to_toml())
+    channel = "interior-2k2?nv=:memory:&eds=x.eds"
+    code, said, told = tool("--sim", channel, "--yes", "flash-params", "set.toml", "--json")
+    assert code == 0 and json.loads(said)["outcome"]["written"] == 1, told
+    assert "not written: motor.pole_pairs: the drive has no object 0x2350:03" in told, "before the consent"
+    assert tool("--sim", channel, "backup", "-o", "b.json")[0] == 0
+
+
+def test_nothing_that_a_map_names_is_no_backup(tool: Tool) -> None:
+    """The map of Elmo has no parameter: a file without entries, exit code 0, which `restore` and `verify` refused."""
+    channel = "interior-2k2?nv=:memory:&drive=elmo"
+    code, _, said = tool("--sim", channel, "backup", "-o", "b.json")
+    assert code == 9 and "backup --eds FILE" in said and not Path("b.json").exists()
+
+
+def test_a_record_in_the_place_of_the_control_word_is_another_profile(tool: Tool) -> None:
+    """CiA 418 has the vehicle's name in 0x6041: `caps` called it a drive, and `stop` was not confirmed."""
+    rows = tuple(row for row in unknown() if row[0] not in (0x1000, 0x6041))
+    record = ((0x1000, 0, "U32", "ro", "0"), (0x6041, 0, "U8", "ro", "1"), (0x6041, 1, "U32", "ro", "0"))
+    write_eds(Path("x.eds"), (*rows, *record))
+    assert tool("caps", "--eds", "x.eds")[0] == 2

@@ -121,7 +121,7 @@ def _read(data: bytes, where: str) -> MakersObjects:
     else:
         eds = parse_eds(data, str(path), NODE_ID)
         found, label, odd = dict(_of_eds(data, eds)), path.stem, _first_of(eds.warnings, f"{path}:")
-    has_words = {(0x6040, 0), (0x6041, 0)} <= set(found)
+    has_words = all((word, 0) in found and (word, 1) not in found for word in (0x6040, 0x6041))  # no records
     stated = MakersObjects(label, found, ()).stored(0x1000) & 0xFFFF  # by the file itself
     rows, assumed = _completed(found)
     if stated != DRIVE_PROFILE and (stated in PROFILES or not has_words):
