@@ -86,7 +86,7 @@ def move_command(
     from pmsmtool.design.design_file import load_design
     from pmsmtool.drive.envelope import Envelope
     from pmsmtool.drive.guard import guarded
-    from pmsmtool.drive.motion_objects import held_current_limits, low_limits
+    from pmsmtool.drive.motion_objects import first_of_axes, held_current_limits, low_limits
     from pmsmtool.drive.own_limits import refuse_no_current
     from pmsmtool.drive.position_drive import PositionDrive
     from pmsmtool.errors import ConfigError
@@ -128,6 +128,7 @@ def move_command(
         foretold = made and limits and foretold_move(made, drive.node.map, gains, way_rad, limits, given)
         lines = [
             *envelope.lines(),
+            *first_of_axes(drive.node),
             *low_limits(drive.node, drive.rated_apk),
             f"the shaft moves by {math.degrees(way_rad):.4g} deg and back with the drive's own position loop, {times} "
             f"time{'s' if times > 1 else ''}",

@@ -25,7 +25,7 @@ from pmsmtool.cia402 import (
     state_of,
 )
 from pmsmtool.drive import objects
-from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.objects import LAST_AXIS, DriveObject, of_axis
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.errors import BusError, DriveFault, DriveTimeout, NotAvailable, SdoAbort
@@ -222,6 +222,17 @@ class DriveNode:
         return one_line(data.rstrip(b"\0").decode("ascii", "replace"))
 
     # ---- CiA 402 --------------------------------------------------------------------------------
+
+    def other_axes(self) -> dict[int, State | None]:
+        """Return the states of the further axes of a device that has several, by number; empty where it has one."""
+        found: dict[int, State | None] = {}
+        with contextlib.suppress(SdoAbort):
+            for axis in range(2, LAST_AXIS + 1):
+                word = self.held(of_axis(objects.STATUSWORD, axis))
+                if word is None:
+                    break
+                found[axis] = state_of(int(word))
+        return found
 
     def state(self) -> State | None:
         """Return the state the statusword shows, None for a pattern CiA 402 does not define."""

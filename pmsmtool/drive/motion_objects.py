@@ -486,6 +486,13 @@ def low_limits(node: DriveNode, rated: float) -> list[str]:
     ]
 
 
+def first_of_axes(node: DriveNode) -> list[str]:
+    """Say of a device with several axes which one is meant; one line, or none."""
+    axes = 1 + len(node.other_axes())
+    told = f"axis      the first of {axes} (0x6041, 0x6841): all is read, moved and written there; `stop` stops all"
+    return [told] if axes > 1 else []
+
+
 def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
     """Return the limits that the drive lacks, or holds far below its rated current, one line each with what to do.
 

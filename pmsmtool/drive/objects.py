@@ -184,6 +184,15 @@ LIVE: dict[str, DriveObject] = {
 _SUFFIX_UNITS = (("_rad_s", "rad/s"), ("_rad", "rad"), ("_nm", "N m"), ("_a", "A"), ("_v", "V"), ("_c", "degC"))
 
 
+AXIS_STEP, LAST_AXIS = 0x800, 8
+"""Between the objects of one axis and of the next, and how many axes a device has at most (CiA 402-1)."""
+
+
+def of_axis(item: DriveObject, axis: int) -> DriveObject:
+    """Return the object of a further axis of a device; the first is 1."""
+    return replace(item, index=item.index + (axis - 1) * AXIS_STEP)
+
+
 def signal_unit(name: str) -> str:
     """Return the unit of a signal from its suffix, ``1`` where it has none."""
     return next((unit for suffix, unit in _SUFFIX_UNITS if name.endswith(suffix)), "1")

@@ -6,7 +6,6 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 from pmsmtool.bus.sdo import OutOfTime
 from pmsmtool.bus.sdo_transfer import when_ready
@@ -14,6 +13,7 @@ from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.cia402 import Command, QuickStop, State, state_of
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import POLL_S, STATE_TIMEOUT_S, DriveNode, is_safe, state_text
+from pmsmtool.drive.objects import LAST_AXIS, of_axis
 from pmsmtool.drive_maps.drive_map import LETTERS
 from pmsmtool.errors import BusError, DriveFault, PmsmtoolError, SdoAbort, StopNotConfirmed
 
@@ -40,8 +40,6 @@ STOP_TRIES = 4
 """A stop is asked for this often: each kind of alarm may end one attempt."""
 BUSY_S = 3.0
 """A drive that refuses because it is busy is asked again for so long."""
-AXIS_STEP, LAST_AXIS = 0x800, 8
-"""Between the objects of one axis and of the next, and how many axes a device has at most (CiA 402-1)."""
 STANDSTILL_MRPM = 5_000.0
 """Speed (thousandths of rpm) below which a drive that stays in quick stop counts as standing."""
 
@@ -109,10 +107,7 @@ def stop_other_axes(node: DriveNode) -> None:
     Raises StopNotConfirmed: one may be energised.
     """
     for axis in range(2, LAST_AXIS + 1):
-        shift = (axis - 1) * AXIS_STEP
-        control, status = (
-            replace(item, index=item.index + shift) for item in (objects.CONTROLWORD, objects.STATUSWORD)
-        )
+        control, status = (of_axis(item, axis) for item in (objects.CONTROLWORD, objects.STATUSWORD))
         shown: State | None = None
         try:
             with node.sdo.limited(silence_s=SILENCE_S, own_s=OWN_S, total_s=ANSWERS_S):

@@ -19,7 +19,7 @@ from pmsmtool.bus.sdo import SdoChannel
 from pmsmtool.bus.sdo_transfer import is_busy, when_ready
 from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.drive import objects
-from pmsmtool.drive.drive_node import STORE_TIMEOUT_S, DriveNode
+from pmsmtool.drive.drive_node import STORE_TIMEOUT_S, DriveNode, state_text
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.parameters import Progress
 from pmsmtool.drive.port import Identity
@@ -225,7 +225,7 @@ class Download:
         check_map(self.node.map, self.identity, self.folder)
         if not self.plan.entries:  # storing would keep what others left in it, for nothing
             raise NotAvailable(
-                f"the map {self.node.map.name!r} has no object of this drive for any value of the set",
+                f"the map {self.node.map.name!r} has no object for any value of the set on this drive",
                 where=f"node {self.node.node}",
                 hint="enter the values with the maker's software, or write the rows of your manual into a map",
             )
@@ -494,13 +494,14 @@ def check_identity(node: DriveNode, expected: Identity) -> None:
 def refuse_while_enabled(node: DriveNode) -> None:
     """Refuse to write to a drive that may drive current; it is never disabled unasked.
 
-    Raises SafetyRefusal: the statusword shows an energised state.
+    Raises SafetyRefusal: the statusword shows an energised state, or that of a further axis does: the reset is of all.
     """
     state = node.state()
-    if state is None or state.energised:
-        name = "an undefined state" if state is None else state.name.replace("_", " ")
+    energised = {"the drive": state} if state is None or state.energised else {}
+    energised |= {f"axis {axis}": its for axis, its in node.other_axes().items() if its is not None and its.energised}
+    for who, shown in energised.items():
         raise SafetyRefusal(
-            f"the drive is in {name}: parameters are not written to a drive that may move",
+            f"{who} is in {state_text(shown)}: parameters are not written to a drive that may move",
             where=f"node {node.node}, 0x6041:00",
             hint=f"`pmsmtool stop -n {node.node}` disables it",
         )

@@ -20,6 +20,7 @@ from pmsmtool.drive.mapped_recorder_drive import records_pushes
 from pmsmtool.drive.motion_objects import (
     LEAST_TURNS,
     NO_RATED,
+    first_of_axes,
     limited_speed,
     position_turns,
     position_units,
@@ -405,7 +406,7 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     if named:  # whatever starts a drive's own identification is not tried on another drive
         found |= {f"vendor {name}" for name in _vendor_quantities(node, drive_map)}
         found |= {"recorder"} if records_pushes(node) else set()
-    replaced = () if rated is None else tuple(watched_by_tool(node, rated))
+    replaced = (*first_of_axes(node), *(() if rated is None else watched_by_tool(node, rated)))
     shown = rated is not None and bool(_told(lambda: undecided(node, rated)))
     return Capabilities(identity, drive_map, named, frozenset(found), described(node), replaced, shown)
 

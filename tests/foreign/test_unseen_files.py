@@ -493,3 +493,14 @@ def test_a_record_in_the_place_of_the_control_word_is_another_profile(tool: Tool
     record = ((0x1000, 0, "U32", "ro", "0"), (0x6041, 0, "U8", "ro", "1"), (0x6041, 1, "U32", "ro", "0"))
     write_eds(Path("x.eds"), (*rows, *record))
     assert tool("caps", "--eds", "x.eds")[0] == 2
+
+
+def test_what_is_told_and_refused_of_a_device_with_a_further_axis(tool: Tool) -> None:
+    """Only `stop` knew of it: a set was stored and the device reset while its second axis was energised."""
+    axis = ((0x6840, 0, "U16", "rw", "0"), (0x6841, 0, "U16", "ro", "0x0237"), (0x1010, 1, "U32", "rw", "1"))
+    write_eds(Path("x.eds"), (*faulhaber(), (0x6081, 0, "U32", "rw", "1000"), *axis))
+    assert "axis      the first of 2 (0x6041, 0x6841)" in tool("caps", "--eds", "x.eds")[1]
+    assign = ("param", "set", "reference.profile_speed_rpm=700", "--store")
+    code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes", *assign)
+    assert code == 5 and "axis 2 is in OPERATION ENABLED" in said
+    assert tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes", "nmt", "reset-node")[0] == 5
