@@ -22,12 +22,13 @@ def nmt_command(bus: BusOptions, out: Output, command: str) -> None:
     from pmsmtool.cia402 import HOMING_LOST
     from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
+    from pmsmtool.drive_maps.shipped_maps import GENERIC, load_family
     from pmsmtool.errors import DriveTimeout, SdoAbort
     from pmsmtool.flash.download import refuse_while_enabled
 
     wanted = NmtCommand[command.replace("-", "_").upper()]
     with bus.connect() as connection:
-        node = DriveNode(connection, choose_node(connection, bus.node))
+        node = DriveNode(connection, choose_node(connection, bus.node), drive_map=load_family(GENERIC))
         try:
             claim(connection, node.node)
             refuse_while_enabled(node)

@@ -224,10 +224,13 @@ class DriveNode:
     # ---- CiA 402 --------------------------------------------------------------------------------
 
     def other_axes(self) -> dict[int, State | None]:
-        """Return the states of the further axes of a device that has several, by number; empty where it has one."""
+        """Return the states of the further axes of a device that has several, by number; empty where it has one.
+
+        The reference drive has one, and is not asked.
+        """
         found: dict[int, State | None] = {}
         with contextlib.suppress(SdoAbort):
-            for axis in range(2, LAST_AXIS + 1):
+            for axis in range(2, 2 if self.map.staging else LAST_AXIS + 1):
                 word = self.held(of_axis(objects.STATUSWORD, axis))
                 if word is None:
                     break

@@ -32,7 +32,7 @@ from pmsmtool.identification.evaluate import tolerance_on
 from pmsmtool.identification.request import MACHINE, REQUEST, IdentifyRequest, Method, place_of
 from pmsmtool.identification.supply_power import resistance_by_supply
 from pmsmtool.identification.value_verdict import TOLD_BY, judged, stage_of
-from pmsmtool.identification.wiring import judge_pulses
+from pmsmtool.identification.wiring import breaks_in, judge_pulses
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate, InverterParameters
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K, magnet_tolerance_per_k
@@ -65,7 +65,7 @@ LIGHT_SHAFT = (
 )
 LATE_CURRENT = (
     "loops of the drive that bring its current up too slowly: {:.0f} % of what was asked for flowed in the second half "
-    "of the torque pulses"
+    "of the torque pulses; or an open phase (`pmsmtool check`)"
 )
 ARRIVED = 0.5
 """Share of the current asked for below which that is the cause: 0.2 where J came out negative, 0.9 and more else."""
@@ -284,7 +284,8 @@ def _by_torque(
             raise
         what = error.what.removeprefix(f"{TOO_WIDE}: ")
         flowed = current_share(pushes)
-        likely = LIGHT_SHAFT if flowed >= ARRIVED else LATE_CURRENT.format(100.0 * flowed)
+        arrived = breaks_in(pushes) or LIGHT_SHAFT
+        likely = arrived if flowed >= ARRIVED else LATE_CURRENT.format(100.0 * flowed)
         too_wide = IdentificationError(TOO_WIDE, what, where=error.where, likely=likely, hint=ADD_INERTIA)
         missing["J_per_psi"] = f"{error.what} (likely {likely})"
     if facts.current_undecided:

@@ -503,4 +503,4 @@ def test_what_is_told_and_refused_of_a_device_with_a_further_axis(tool: Tool) ->
     assign = ("param", "set", "reference.profile_speed_rpm=700", "--store")
     code, _, said = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes", *assign)
     assert code == 5 and "axis 2 is in OPERATION ENABLED" in said
-    assert tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "--yes", "nmt", "reset-node")[0] == 5
+    assert tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "nmt", "reset-node")[0] == 5

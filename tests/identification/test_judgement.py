@@ -16,6 +16,7 @@ from pmsmtool.identification.by_pulses import PulseFacts, pulse_result
 from pmsmtool.identification.completed_machine import completed_machine
 from pmsmtool.identification.request import Method
 from pmsmtool.identification.value_verdict import Judgement, judged, stage_of
+from pmsmtool.identification.wiring import breaks_in
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file, machine_path
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
@@ -113,6 +114,20 @@ def test_a_current_that_comes_too_late_is_the_reason(monkeypatch: pytest.MonkeyP
     with pytest.raises(IdentificationError) as caught:
         pulse_result(pushes, PulseFacts(Method.STANDARD, pole_pairs=7, pushed=True))
     assert named in caught.value.likely
+
+
+def test_a_current_that_breaks_in_at_some_angles_is_likely_an_open_phase() -> None:
+    """EPOS4 with factory gains: J/psi was too wide for "a bare shaft", the pulses turned by 0.05 to 0.8 of a turn."""
+    t, units = 0.001 * np.arange(40), {"i_q_a": "A", "theta_M_rad": "rad"}
+
+    def seen(at: float, open_phase: bool) -> Trace:
+        angle = at + 0.6 * (t / t[-1]) ** 2
+        current = np.abs(np.sin(angle)) + 0.1 if open_phase else np.full(40, 0.95)
+        return Trace(t, {"i_q_a": current, "theta_M_rad": angle}, units, {"i_command_a": 1.0})
+
+    for open_phase in (True, False):
+        told = breaks_in([seen(at, open_phase) for at in (0.2, 0.8, 1.4, 2.5)])
+        assert ("an open phase" in told) is open_phase, told
 
 
 def test_a_useless_value_is_refused_alone_and_the_others_are_kept(known: MachineFile) -> None:
