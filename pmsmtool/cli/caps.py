@@ -18,10 +18,6 @@ if TYPE_CHECKING:
     from pmsmtool.measurement.capabilities import Capabilities, Row
 
 
-OF_AXIS = "by a set of `tune --axis`"
-"""Said of a value that no other set writes (``drive_maps.drive_map.NOT_ALONE``)."""
-
-
 @click.command(
     "caps",
     epilog=examples(
@@ -131,8 +127,8 @@ def _parameter_lines(found: Capabilities, sources: bool) -> list[str]:
     reasons = ((drive_map.row_text(n) if sources else n, why) for n, why in _unwritten(found).items())
     written = {name: drive_map.cells[name] for name in _written(found)}
     rows = [
-        (f"written: {name}", f"0x{row.index:04X}:{row.sub:02X}", row.wire, OF_AXIS if drive_map.scale_of(row) else "")
-        for name, row in written.items()
+        (f"written: {n}", f"0x{row.index:04X}:{row.sub:02X}", row.wire, drive_map.scale_of(row) and "by `tune --axis`")
+        for n, row in written.items()
     ]
     lines = [f"written: {drive_map.row_text(name)}" for name in written] if sources else table([""] * 4, rows)[1:]
     return [

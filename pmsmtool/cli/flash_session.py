@@ -36,7 +36,7 @@ def carry_out(
     """Plan, ask, write, print; the download is put into ``jobs`` (``flash.download.set_named``)."""
     from pmsmtool.errors import CheckFailed
     from pmsmtool.flash.journal import JournalFolder
-    from pmsmtool.flash.restore import marks_of, plan_download
+    from pmsmtool.flash.restore import marks_of, plan_download, tell_lacking
 
     identity = checked_identity(node, out)
     looking = dry_run or check
@@ -54,6 +54,7 @@ def carry_out(
         marks = marks_of(plan.content, datetime.datetime.now())
         outcome = write_plan(node, jobs, identity, plan, marks, bus, motion, out, store=store)
         out.result(command, {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])
+        tell_lacking(node, plan)
 
 
 def write_plan(

@@ -16,7 +16,7 @@ from pathlib import Path
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.drive.drive_node import NOT_READ, DriveNode
 from pmsmtool.drive.port import Identity
-from pmsmtool.drive_maps.drive_map import DriveMap
+from pmsmtool.drive_maps.drive_map import Cell, DriveMap
 from pmsmtool.drive_maps.drive_map_file import map_hash
 from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of, load_family, unnamed_drive
 from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
@@ -121,18 +121,24 @@ def map_on(node: DriveNode) -> DriveMap:
     """
     gone: dict[str, str] = {}
     for cell in () if node.map.staging else node.map.cells.values():
-        where = f"0x{cell.index:04X}:{cell.sub:02X}"
-        try:
-            size = len(node.sdo.upload(cell.index, cell.sub).data)
-        except SdoAbort as abort:
-            if abort.code not in NOT_READ:
-                raise
-            hidden = "shows nothing in" if abort.code == AbortCode.WRITE_ONLY else "has no object"
-            gone[cell.name] = f"the drive {hidden} {where}"
-            continue
-        if size != cell.size:
-            gone[cell.name] = f"the drive holds {counted(size, 'byte')} in {where}, the map states {cell.wire}"
+        why = _not_there(node, cell) and _not_there(node, cell)  # twice: one answer may be damaged
+        if why:
+            gone[cell.name] = why
     return node.map.without(gone) if gone else node.map
+
+
+def _not_there(node: DriveNode, cell: Cell) -> str:
+    """Return why a row is not the drive's; empty where its object is there, in the size that the map states."""
+    where = f"0x{cell.index:04X}:{cell.sub:02X}"
+    try:
+        size = len(node.sdo.upload(cell.index, cell.sub).data)
+    except SdoAbort as abort:
+        if abort.code not in NOT_READ:
+            raise
+        return f"the drive {'shows nothing in' if abort.code == AbortCode.WRITE_ONLY else 'has no object'} {where}"
+    return (
+        "" if size == cell.size else f"the drive holds {counted(size, 'byte')} in {where}, the map states {cell.wire}"
+    )
 
 
 def _other_drive(drive_map: DriveMap, identity: Identity) -> ConfigError:

@@ -14,7 +14,7 @@ from pmsmtool.drive.motion_objects import held_current_limits, rated_apk
 from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap, address_in
-from pmsmtool.errors import ConfigError, NotAvailable, SafetyRefusal, SdoAbort
+from pmsmtool.errors import ConfigError, NotAvailable, Partial, SafetyRefusal, SdoAbort
 from pmsmtool.flash.download import Outcome
 from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
 from pmsmtool.flash.map_gate import map_on
@@ -22,6 +22,7 @@ from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
 from pmsmtool.flash.whole_drive import parameters_of
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.params.parameter_set import ParameterSet, table_unit
+from pmsmtool.plain_text import counted
 
 CONFIGURATION_EPOCH = datetime.date(1984, 1, 1)
 """Day 0 of object 0x1020:01 (CiA 301, section 7.5.2.21)."""
@@ -58,6 +59,19 @@ def plan_download(node: DriveNode, wanted: ParameterSet) -> Plan:
     parameters = _settled(node)
     held = map_on(node)
     return make_plan(held, wanted, parameters.read(names_to_read(held, wanted)))
+
+
+def tell_lacking(node: DriveNode, plan: Plan) -> None:
+    """Raise Partial where values of a set have a row in the map and no object on this drive."""
+    lacking = [
+        f"{name}: {plan.reasons[name]}" for name in plan.missing if name in node.map.cells and name in plan.reasons
+    ]
+    if lacking:
+        raise Partial(
+            f"{counted(len(lacking), 'value')} with a row in the map {node.map.name!r} could not be written",
+            where=f"node {node.node}", missing=lacking,
+            hint="correct the rows in a copy of the map for this drive, and give it with --map",
+        )  # fmt: skip
 
 
 def plan_restore(node: DriveNode, snapshot: Snapshot) -> Plan:
