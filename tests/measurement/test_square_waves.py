@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from pmsmtool.estimators.encoder import EncoderResult
+from pmsmtool.estimators.estimate import Verdict
+from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import square_injection
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.measurement.square_waves import LEADS, SquareStage
+from pmsmtool.measurement.square_waves import LEADS, SquareStage, knee_of
 from pmsmtool.trace import Trace
 
 PAIRS = 4
@@ -39,3 +42,14 @@ def test_a_shot_is_recorded_until_the_rotor_stands_still(
     shot = stage._still(ENCODER, PLAN, "q", 9, 50.0)
     assert [plan.lead_s for plan in plans] == pytest.approx([lead * PLAN.lead_s for lead in LEADS[:recorded]])
     assert math.degrees(float(shot["theta_M_rad"][-1])) * PAIRS == pytest.approx(ways_deg[recorded - 1])
+
+
+@pytest.mark.parametrize(("plateau_v", "knee_a"), [(5e-4, 0.5), (5.0, 2.0)])
+def test_an_error_within_the_interval_of_R_has_no_knee(plateau_v: float, knee_a: float) -> None:
+    """A plateau of 0.5 mV had a knee of 54 A on levels up to 12 A: the ripple was a fifth of the wanted one."""
+    i = np.linspace(0.5, 12.0, 12)
+    noise_v = 1e-4 * np.sin(7.0 * np.arange(12.0))
+    error_v = noise_v if plateau_v < 1.0 else plateau_v * np.minimum(1.0, i / knee_a)
+    curve = InverterCurve(i, error_v, 0.0)
+    R = Estimate(0.9, 1e-3, 0.01, "ohm")  # 24 mV of interval at 12 A
+    assert knee_of(ResistanceResult(R, R, curve, plateau_v, 0.0, Verdict.PASS)) == pytest.approx(knee_a, rel=1e-3)
