@@ -56,8 +56,9 @@ class AngleDependence:
 
 
 def over_angle(
-    fit: AxisFit, first: Shot, others: Sequence[Shot], angles_rad: Sequence[float], mixed: Sequence[float] = ()
-) -> AngleDependence:
+    fit: AxisFit, first: Shot, others: Sequence[Shot], angles_rad: Sequence[float],
+    mixed: Sequence[float] = (), std: float = 0.0,
+) -> AngleDependence:  # fmt: skip
     """Return how an inductance depends on the angle.
 
     Parameters
@@ -72,18 +73,20 @@ def over_angle(
         Electrical angles of the rotor during ``first`` and during these.
     mixed : sequence of float, optional
         Logarithms of what these see more of L, because the frame stood otherwise to the rotor than at ``first``.
+    std : float
+        Standard deviation of the comparison beside :data:`RATIO_STD`.
     """
     here = _log_inductance(fit, first)
     more = np.array(mixed or [0.0] * len(others))
     ratios = np.array([_log_inductance(fit, shot) - here for shot in others]) - more
-    covariance, lever, std = _harmonics(angles_rad)
+    covariance, lever, left = _harmonics(angles_rad, std)
     likely = np.linalg.solve(covariance, ratios)
     mean = float(lever @ likely)
     seen = float(np.max(np.abs(np.append(ratios, 0.0) - mean)))
     if not seen > UNEVEN:
         mean = seen = 0.0
     # harmonics are as large as usual, and as the ratios say
-    unseen = COVERAGE_FACTOR * std * math.sqrt((1.0 + float(ratios @ likely)) / (1.0 + len(ratios)))
+    unseen = COVERAGE_FACTOR * left * math.sqrt((1.0 + float(ratios @ likely)) / (1.0 + len(ratios)))
     return AngleDependence(math.exp(mean), seen + unseen if seen + unseen > UNEVEN else 0.0)
 
 
@@ -92,12 +95,12 @@ def unseen_std(angles_rad: Sequence[float]) -> float:
     return _harmonics(angles_rad)[2]
 
 
-def _harmonics(angles_rad: Sequence[float]) -> tuple[Array, Array, float]:
+def _harmonics(angles_rad: Sequence[float], std: float = 0.0) -> tuple[Array, Array, float]:
     """Covariance of the ratios to the first angle, theirs with the mean over it, and what they leave of the mean."""
     apart = np.subtract.outer(angles_rad, angles_rad)
-    harmonics = sum(std**2 * np.cos(number * apart) for number, std in HARMONICS.items())
+    harmonics = sum(size**2 * np.cos(number * apart) for number, size in HARMONICS.items())
     lever = harmonics[0, 0] - harmonics[1:, 0]
-    ratios = harmonics[1:, 1:] - harmonics[1:, :1] + lever + RATIO_STD**2 * np.eye(len(lever))
+    ratios = harmonics[1:, 1:] - harmonics[1:, :1] + lever + (RATIO_STD**2 + std**2) * np.eye(len(lever))
     left = harmonics[0, 0] - lever @ np.linalg.solve(ratios, lever)
     return ratios, lever, math.sqrt(max(0.0, float(left)))
 

@@ -33,11 +33,8 @@ from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
 MODEL_FLOOR = 1e-4
-"""Relative standard deviation added for what the model leaves out.
-
-docs/identification.md, 4 has 3e-4 where nothing better is known; here bridge, commutation and rotor have terms of
-their own.
-"""
+"""Relative standard deviation added for what the model leaves out; docs/identification.md, 4 has 3e-4 where nothing
+better is known, here bridge, commutation and rotor have terms of their own."""
 FREQUENCY_LIMIT = 0.01
 """Relative difference between two injection frequencies above which both values are reported."""
 ROTOR_LIMIT_RAD = math.radians(2.0)
@@ -150,6 +147,7 @@ def estimate_inductances(
     U_dc_v: float = math.inf,
     tolerance: SensorTolerance | None = None,
     further: Mapping[str, Sequence[tuple[Trace, float]]] | None = None,
+    unseen_a: float = 0.0,
 ) -> InductanceResult:
     """Incremental inductances from square-wave shots.
 
@@ -182,6 +180,8 @@ def estimate_inductances(
     further : mapping of str to sequence of (Trace, float), optional
         Shots at more angles of the rotor by axis, with the shortest half period, and the angle of the frame ahead
         of the rotor's d axis during each (rad electrical): L is then the mean over the angle.
+    unseen_a : float
+        Current of the legs that no sample holds, of which iron loss makes the most (A); 0: nothing shows one.
     """
     tolerance = tolerance or SensorTolerance()
     cross: dict[str, tuple[float, float]] = {}
@@ -219,7 +219,7 @@ def estimate_inductances(
             frame, fallback = FrameAhead(0.0, 0.0, 0.0), "frame offset unknown, machine nearly round: axes as they are"
     values, stds = _unmix(fits, {axis: factor for axis, (_, factor, _) in widen.items()}, frame)
     stood = {axis: float(records[0].meta["fixed_angle_rad"]) for axis, records in traces.items()}
-    uneven = _over_angle(fits, shots, further or {}, inverter, U_dc_v, frame, stood, values)
+    uneven = _over_angle(fits, shots, further or {}, inverter, U_dc_v, frame, stood, values, unseen_a)
     biases = {"d": _bias(d_shots, frame.d_rad), "q": _bias(q_shots, frame.q_rad)}
     dependent = tuple(
         axis
@@ -235,6 +235,7 @@ def estimate_inductances(
                 MODEL_FLOOR * values[axis],
                 tolerance.voltage_scale_std * values[axis],
                 _commutation_std(shots[axis]),
+                _unseen_std(shots[axis][0], unseen_a) * values[axis],
                 _eddy_std(fits[axis]) * values[axis],
                 _resistance_std(fits[axis], shots[axis][0], R_ohm),
             ),
@@ -277,15 +278,10 @@ def estimate_inductances(
 
 
 def _over_angle(
-    fits: Mapping[str, AxisFit],
-    shots: Mapping[str, Sequence[Shot]],
-    further: Mapping[str, Sequence[tuple[Trace, float]]],
-    inverter: InverterCurve | None,
-    U_dc_v: float,
-    frame: FrameAhead,
-    frames_rad: Mapping[str, float],
-    L_h: Mapping[str, float],
-) -> dict[str, AngleDependence]:
+    fits: Mapping[str, AxisFit], shots: Mapping[str, Sequence[Shot]],
+    further: Mapping[str, Sequence[tuple[Trace, float]]], inverter: InverterCurve | None, U_dc_v: float,
+    frame: FrameAhead, frames_rad: Mapping[str, float], L_h: Mapping[str, float], unseen_a: float,
+) -> dict[str, AngleDependence]:  # fmt: skip
     """Return by axis how its inductance depends on the angle of the rotor, where that was measured.
 
     What counts is where the rotor stood: cogging and bias turn it away from the frame, which then sees a part of the
@@ -307,7 +303,8 @@ def _over_angle(
         stood = [frames_rad[axis], *(float(record.meta["fixed_angle_rad"]) for record, _ in records)]
         angles = [frame_rad - ahead for frame_rad, ahead in zip(stood, aheads, strict=True)]
         if others:
-            found[axis] = over_angle(fits[axis], shots[axis][0], others, angles, [there - here for there in mixed])
+            std = max(_unseen_std(shot, unseen_a) for shot in others)
+            found[axis] = over_angle(fits[axis], shots[axis][0], others, angles, [there - here for there in mixed], std)
     return found
 
 
@@ -326,11 +323,7 @@ def _with_angle(L: Estimate, at: AngleDependence | None) -> Estimate:
 
 
 def _fitted(
-    shots: dict[str, list[Shot]],
-    sigma_a: float,
-    R_ohm: float,
-    motion: Motion | None,
-    instant: ShownInstant | None,
+    shots: dict[str, list[Shot]], sigma_a: float, R_ohm: float, motion: Motion | None, instant: ShownInstant | None
 ) -> dict[str, AxisFit]:
     """Fit both axes, d first; where a fit leaves sines that are not the injection's, again without these."""
     fits: dict[str, AxisFit] = {}
@@ -404,15 +397,21 @@ def _commutation_std(shots: Sequence[Shot]) -> float:
     What depends on the current acts at one switching edge (``VoltageError``); where that edge lies is known to
     :data:`EDGE_STD` of a period, and a slope de/di there looks like an inductance of |de/di| T_s times that.
     """
-    worst = 0.0
-    for shot in shots:
-        if shot.error is not None:
-            low, high = float(np.min(shot.i_a)), float(np.max(shot.i_a))
-            for part in (shot.error.early_v, shot.error.late_v):
-                rise = np.interp([low, high], shot.error.i_a, part)
-                slope = abs(float(rise[1] - rise[0])) / (high - low)
-                worst = max(worst, EDGE_STD * slope * shot.period_s)
-    return worst
+    return max(EDGE_STD * slope * shot.period_s for shot in shots for slope in _slopes(shot))
+
+
+def _unseen_std(shot: Shot, unseen_a: float) -> float:
+    """Relative standard deviation of L by what a current that no sample holds makes of the inverter's error."""
+    return sum(_slopes(shot)) * unseen_a / float(np.mean(np.abs(shot.u_v - np.mean(shot.u_v))))
+
+
+def _slopes(shot: Shot) -> list[float]:
+    """Slopes of both parts of an inverter's error over the currents of a shot (ohm)."""
+    if shot.error is None:
+        return [0.0]
+    ends = np.array([np.min(shot.i_a), np.max(shot.i_a)])
+    parts = shot.error.early_v, shot.error.late_v
+    return [abs(float(np.ptp(np.interp(ends, shot.error.i_a, part)) / np.ptp(ends))) for part in parts]
 
 
 def bare_shot(trace: Trace, axis: str) -> Shot:
@@ -425,11 +424,8 @@ def bare_shot(trace: Trace, axis: str) -> Shot:
 def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, U_dc_v: float, stage: str) -> Shot:
     half_period = int(trace.meta["half_period"])
     if len(trace) < SKIP_SAMPLES + 2 * half_period * MINIMUM_PERIODS:
-        raise refuse(
-            "E_EXCITATION",
-            f"{len(trace)} samples hold fewer than {MINIMUM_PERIODS} periods of {2 * half_period}",
-            stage=stage,
-        )
+        few = f"{len(trace)} samples hold fewer than {MINIMUM_PERIODS} periods of {2 * half_period}"
+        raise refuse("E_EXCITATION", few, stage=stage)
     if "flagged" in trace.signals and np.any(trace["flagged"] > 0.0):
         raise refuse("E_CLIPPED", f"{int(np.sum(trace['flagged'] > 0.0))} samples limited or clipped", stage=stage)
     way = math.degrees(rotor_way(float(trace.meta["pole_pairs"]) * trace["theta_M_rad"]))
