@@ -21,7 +21,7 @@ from pmsmtool.estimators.injection.inductance import InductanceResult
 from pmsmtool.estimators.resistance import at_the_test
 from pmsmtool.identification import flux_map, frequency_response
 from pmsmtool.identification.completed_machine import CompletedMachine
-from pmsmtool.identification.evaluate import NOTABLY_WIDER, Evaluation
+from pmsmtool.identification.evaluate import NOTABLY_WIDER, Evaluation, unseen_current
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
 from pmsmtool.identification.sampling import timing_warnings
 from pmsmtool.identification.verdicts import KEYS, NOT_ACCEPTED, STEP, Verdicts, verdicts_of
@@ -203,6 +203,8 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions[SUPPLY] = evaluation.supply_w
     if evaluation.shown is not None:
         conditions["shown_instant_s"] = evaluation.shown.value_s
+    if evaluation.flux is not None and evaluation.flux.apart_wb and evaluation.resistance is not None:
+        conditions["unseen_current_a"] = unseen_current(evaluation.flux, evaluation.resistance.curve)
     if "frf" in request.measured:
         conditions[frequency_response.SHOWN] = frequency_response.shown_of(evaluation.frequency_response)
     if evaluation.swing_hz:

@@ -139,8 +139,12 @@ static void charge_link(pmsm_sim *sim, double T_s)
 static void catch_currents(const pmsm_sim *sim, double i[3])
 {
     const pmsm_plant *plant = &sim->plant;
-    for (int x = 0; x < 3; x++)
+    const double hidden = sim->setup.iron_hidden;
+    for (int x = 0; x < 3; x++) {
         i[x] = sim->lag.tau > 0.0 ? sim->lag.value[x] : pmsm_plant_leg_current(plant, x);
+        if (hidden > 0.0)
+            i[x] -= hidden * (pmsm_leg_alpha[x] * plant->iron_alpha + pmsm_leg_beta[x] * plant->iron_beta);
+    }
 }
 
 /* A low-side shunt reads its leg only while the bottom transistor conducts long enough around the sample. */

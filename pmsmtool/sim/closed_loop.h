@@ -72,6 +72,7 @@ typedef struct {               /* everything that is fixed during a run */
     double load;               /* N m */
     double sensor_lag;         /* s */
     double sampling_shift;     /* s, positive: late; late needs a whole period of delay */
+    double iron_hidden;        /* share of the iron-loss current that no sample holds: at the zero vector none flows */
     uint64_t seed;
     uint32_t delay;            /* whole periods of computation delay, 0 or 1 (or more) */
     uint32_t application;      /* enum pmsm_runs */

@@ -381,6 +381,28 @@ def test_an_iron_loss_of_the_prediction_brakes_no_more_than_friction_does() -> N
     assert max(free) > 4.0 * max(drags) and all(one.machine.B >= 0.0 for one in drawn)
 
 
+@pytest.mark.chain
+def test_an_iron_loss_that_no_sample_holds_is_drawn_up_to_what_brakes_like_friction() -> None:
+    """The legs carry it within the pulses: a healthy drive with 4.9 % of it was at 1.01 of its band in i_q."""
+    plain = design()
+    made = replace(plain, machine=replace(plain.machine, conditions={"unseen_current_a": 0.3}))
+    known = made.machine.machine
+    B, limits = known.B_nms or 0.0, conditions(made)
+    plan = plan_proof(made, limits)
+    drawn = SimulatedDrives(made, limits, plan, 16, 0).setups
+    drags = [iron_drag(one.machine.pole_pairs, one.machine.psi_f, one.machine.R_iron) for one in drawn]
+    assert {one.iron_hidden for one in drawn} == {1.0}
+    assert 0.0 < min(drags) < 0.3 * B and 0.7 * B < max(drags) <= B
+    # however badly B is known, no more than 8 % of the rated power
+    unsure = replace(made, machine=replace(made.machine, std={**made.machine.std, "B_nms": 1e3 * B}))
+    most = 0.08 * known.torque_nm(0.0, known.I_nom_apk or 0.0) / ((known.n_nom_rpm or 0.0) * RAD_S_PER_RPM)
+    for one in SimulatedDrives(unsure, limits, plan, 16, 0).setups:
+        assert iron_drag(one.machine.pole_pairs, one.machine.psi_f, one.machine.R_iron) <= most * (1.0 + 1e-9)
+    still = replace(made, machine=replace(made.machine, machine=replace(known, B_nms=0.0)))
+    for without in (still, plain):
+        assert all(one.machine.R_iron == 0.0 for one in SimulatedDrives(without, limits, plan, 4, 0).setups)
+
+
 def test_the_prediction_has_harmonics_and_the_noise_of_the_encoder() -> None:
     """Of 3.7 % in the back-EMF i_q of a speed step was at 1.29 of its band, by 2.1 steps of noise at 1.21."""
     source = light()

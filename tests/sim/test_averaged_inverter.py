@@ -333,6 +333,11 @@ def test_iron_loss_takes_a_current_and_brakes():
     assert i_q == pytest.approx(-emf / R_iron, rel=0.02)
     assert torque * omega == pytest.approx(-1.5 * emf**2 / R_iron, rel=0.02)
     assert abs(i_d) < 0.05
+    # a sample that holds none of it: the drive holds the magnetising current at zero, and that makes no torque
+    hidden = open_simulation(lambda setup: (change(setup), setattr(setup, "iron_hidden", 1.0))[0])
+    hidden.run(2000)
+    i_d, i_q, torque = np.mean(record(hidden, [Truth.I_D, Truth.I_Q, Truth.TORQUE], 200), axis=1)
+    assert abs(torque) < 0.05 and math.hypot(i_d, i_q) < 0.05
 
 
 def test_eddy_branch_lowers_the_inductance_that_fast_changes_see():
