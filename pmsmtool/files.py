@@ -235,12 +235,14 @@ def write_file(path: Path, content: bytes | str, *, synced: bool = False, hint: 
 
 
 def refuse_full(folder: Path, room: int, *, hint: str) -> None:
-    """Make a folder and refuse one that does not take ``room`` bytes; nothing of the trial stays in it.
+    """Refuse a folder, there or to be made, that does not take ``room`` bytes; nothing of the trial stays.
 
     Raises ConfigError: it cannot be made or written, or its disk is full; ``hint`` is the next step.
     """
-    make_folder(folder, hint=hint)
-    trial = Path(folder) / ".room"
+    there = next(path for path in (Path(folder), *Path(folder).absolute().parents) if os.path.lexists(path))
+    if not os.path.isdir(there):
+        make_folder(folder, hint=hint)  # says why it cannot
+    trial = there / ".room"
     write_file(trial, bytes(room), hint=hint)
     trial.unlink(missing_ok=True)
 
