@@ -20,8 +20,9 @@ AWAITED_STEPS = 4
 
 
 def hold(
-    simulation: Simulation, experiment: Experiment, increments: int, T_s: float, phase: int, held_nm: float
-) -> None:
+    simulation: Simulation, experiment: Experiment, increments: int, T_s: float, phase: int, held_nm: float,
+    weakened_a: float = 0.0,
+) -> None:  # fmt: skip
     """Let the position loop hold the shaft where it is, ready for the move of an experiment.
 
     The torque that the loop holds against friction is what stopped the shaft before: any within the Coulomb torque.
@@ -36,6 +37,8 @@ def hold(
         Control periods more than the drive holds.
     held_nm : float
         Torque that is held (N m).
+    weakened_a : float
+        d current that field weakening has from before (A).
     """
     assert experiment.move is not None
     asked = simulation.position.asked
@@ -47,7 +50,15 @@ def hold(
     simulation.word(Part.ENABLED).value = 1
     simulation.run(1)  # the first period clears the controllers
     simulation.floats_at(Part.SPEED_INTEGRAL, 1)[0] = held_nm
+    weaken(simulation, weakened_a)
     simulation.run(phase + round(HELD_S / T_s))
+
+
+def weaken(simulation: Simulation, i_d_a: float) -> None:
+    """Let field weakening have a d current (A) from before, once the search has ended that it began with."""
+    if i_d_a:
+        simulation.run(simulation.params.field_weakening_iterations)
+        simulation.floats_at(Part.FIELD_WEAKENING, 1)[0] = i_d_a
 
 
 def record_move(simulation: Simulation, experiment: Experiment) -> Array:

@@ -51,6 +51,7 @@ void *pmsm_sim_part(pmsm_drive *drive, uint32_t part)
     case PMSM_PART_APPLICATION: return &drive->application;
     case PMSM_PART_POSITION: return &drive->application.position;
     case PMSM_PART_SPEED_INTEGRAL: return &drive->application.control.speed_integrator;
+    case PMSM_PART_FIELD_WEAKENING: return &drive->application.control.fw_reference;
     default: return NULL;
     }
 }

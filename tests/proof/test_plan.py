@@ -307,6 +307,24 @@ def test_the_predicted_records_begin_at_their_speed(psi_f_wb: float) -> None:
             assert (begun >= BASE_SPEED[0] - BEGUN).all() and (begun <= BASE_SPEED[1] + BEGUN).all()
 
 
+MEMORY, NONE_LEFT = 0.6, 0.05
+"""Range of the d current at the begin of the predicted records, of that of least current at rated torque: 0.73, and
+without a search at most 0.01."""
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize(("mode", "searches"), [("accelerated", True), ("lookup", False)])
+def test_the_predicted_records_begin_with_any_d_current_of_a_search(mode: str, searches: bool) -> None:
+    """The search takes seconds: a healthy machine had a fifth of that current, its prediction a hundredth."""
+    made = tune(load_machine_file(data_folder("profiles") / "fast-ipm.toml"), TuneRequest(field_weakening=mode))
+    limits = conditions(made, U_dc_v=made.machine.inverter.U_dc_v)
+    plan = plan_proof(made, limits)
+    step = next(e for e in plan.experiments if e.name == "speed_step")
+    begun = SimulatedDrives(made, limits, plan, 8, 0).respond(step)[:, SIGNALS.index("i_d_a"), 0]
+    share = np.ptp(begun / made["field_weakening.i_d_lm_a"])
+    assert share > MEMORY if searches else share < NONE_LEFT
+
+
 SETTLED = 0.03
 """Mean predicted i_q before a step, of the step (seed 140098 at 84 degC: 0.010; 0.049 after 64 periods, 1 L/R)."""
 
