@@ -40,7 +40,7 @@ FRICTION_SHARE = 0.03
 """Largest Coulomb and viscous friction, of the rated torque, where the machine file gives none."""
 FRICTION_FACTOR = 2.0
 """Factor either way where it gives them, and their standard deviation."""
-LAG_SHARES, LAG_S = (0.1, 0.4), 20e-6
+LAG_SHARES, LAG_S = (0.1, 0.65), 20e-6
 """Largest lag of the current sensors where it was not identified: that of amplifier and filter (s), within these shares
 of the control period. With a tenth of it a healthy drive (17 of 44 us) was 1.23 half widths of the delay off. Short
 ones are drawn more often."""
