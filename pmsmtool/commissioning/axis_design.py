@@ -163,6 +163,9 @@ def design_axis(
     fitting = dict(wanted.values)
     for group in GROUPS:
         fitting |= _slowed(drive_map, group, wanted)
+    if CASCADE[0] in fitting and fitting.get(SPEED[0], 0.0) > 0.0:  # no faster than the speed loop below it
+        share = fitting[SPEED[0]] / wanted.values[SPEED[0]]
+        fitting[CASCADE[0]] = min(fitting[CASCADE[0]], share * wanted.values[CASCADE[0]])
     less = _cut(drive_map, wanted)
     slower = [name for name, value in fitting.items() if value < wanted.values[name]]
     faster = [name for name, value in fitting.items() if value > wanted.values[name]]
@@ -192,7 +195,7 @@ def design_axis(
     return replace(design, notes=(*design.notes, *notes))
 
 
-GROUPS = ({SPEED[0]: 1, SPEED[1]: 2}, {PID[0]: 2, PID[1]: 3, PID[2]: 1})
+GROUPS = ({SPEED[0]: 1, SPEED[1]: 2}, {CASCADE[0]: 1}, {PID[0]: 2, PID[1]: 3, PID[2]: 1})
 """Gains of one controller, and the power of its crossover with which each grows."""
 LEAST_DEG = 35.0
 """Least phase margin over the tolerance box with an integral time shorter than designed."""

@@ -150,6 +150,26 @@ def test_an_integral_time_beyond_its_object_is_the_longest_it_holds(K_i: float, 
     made.encode(replace(wanted, values=found))
 
 
+@pytest.mark.chain
+@pytest.mark.parametrize(("K_p_most", "K_v_most"), [(0.25, 1.0), (1.0, 0.25)])
+def test_a_position_loop_is_no_faster_than_a_speed_loop_that_its_objects_slow(K_p_most: float, K_v_most: float) -> None:
+    """K_v stayed as designed over a K_p that its object cut: 23.8 degrees on a Copley."""
+
+    def design(K_p: float, K_v: float) -> Design:
+        rows = [
+            MeasuredRow(SPEED[0], 0x60F9, 1, "UNSIGNED16", "value", "", K_p / 65535.0, "N m s/rad", 0.1),
+            MeasuredRow(CASCADE[0], 0x60FB, 1, "UNSIGNED16", "value", "", K_v / 65535.0, "1/s", 0.1),
+        ]
+        own = with_measured(load_family("cia402"), 0x999, 1, rows, "on a bench", None)
+        return design_axis(machine(0.0, 0.0), TuneRequest(), ASKED, own)
+
+    whole = design(10.0, 1000.0)
+    cut = design(K_p_most * whole[SPEED[0]], K_v_most * whole[CASCADE[0]])
+    assert cut[CASCADE[0]] == pytest.approx(0.25 * whole[CASCADE[0]], rel=1e-3)
+    assert cut[SPEED[0]] == pytest.approx(K_p_most * whole[SPEED[0]], rel=1e-3)
+    assert cut.facts["axis_margins_kept"]
+
+
 def test_a_gain_beyond_its_object_is_cut_and_judged_so() -> None:
     """EPOS2 keeps gains as INTEGER16: K_p of the speed loop would be 35 200 counts."""
     made = designed("epos2", 0.0, 0.0)
