@@ -35,6 +35,8 @@ else:
 _LOCKED_BYTE = 1 << 30
 """Windows locks bytes, and who holds the file must stay readable: the locked byte lies behind the text."""
 _LONGEST_OWNER = 200
+_LOOKS, _LOOK_S = 20, 0.01
+"""Looks at a lock whose holder has not said yet who it is, and time between them (s): it does next."""
 IDENTITY_S = 5.0
 """Time for three numbers; a drive that answers needs 5 ms."""
 
@@ -79,7 +81,13 @@ def _hold(connection: Connection, key: Callable[[], str], what: str, where: str,
     except (OSError, ConfigError):
         return  # nothing can be written for this user: no journal either, so nothing is downloaded
     if not _lock(descriptor):
-        owner = one_line(os.read(descriptor, _LONGEST_OWNER).decode("utf-8", "replace").strip()) or "unknown"
+        owner = _said(descriptor)
+        for _ in range(_LOOKS):  # it has the lock before it has said who it is
+            if owner:
+                break
+            connection.clock.wait(_LOOK_S)
+            owner = _said(descriptor)
+        owner = owner or "unknown"
         os.close(descriptor)
         raise SecondMaster(
             f"another pmsmtool works with {what}: {owner}",
@@ -134,6 +142,12 @@ def _lock(descriptor: int) -> bool:
             os.lseek(descriptor, 0, os.SEEK_SET)
         return False
     return True
+
+
+def _said(descriptor: int) -> str:
+    """Return what the holder of a lock says of itself; empty where it has not yet."""
+    os.lseek(descriptor, 0, os.SEEK_SET)
+    return one_line(os.read(descriptor, _LONGEST_OWNER).decode("utf-8", "replace").strip())
 
 
 def _owner() -> str:

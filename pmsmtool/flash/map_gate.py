@@ -123,7 +123,8 @@ def map_on(node: DriveNode) -> DriveMap:
     for cell in () if node.map.staging else node.map.cells.values():
         why = _not_there(node, cell) and _not_there(node, cell)  # twice: one answer may be damaged
         if why:
-            gone[cell.name] = why
+            source = f"source {cell.source!r}" if cell.source else "no source stated"
+            gone[cell.name] = f"{why} ({cell.wire} in the map {node.map.name!r}, {source})"
     return node.map.without(gone) if gone else node.map
 
 
@@ -136,9 +137,7 @@ def _not_there(node: DriveNode, cell: Cell) -> str:
         if abort.code not in NOT_READ:
             raise
         return f"the drive {'shows nothing in' if abort.code == AbortCode.WRITE_ONLY else 'has no object'} {where}"
-    return (
-        "" if size == cell.size else f"the drive holds {counted(size, 'byte')} in {where}, the map states {cell.wire}"
-    )
+    return "" if size == cell.size else f"the drive holds {counted(size, 'byte')} in {where}"
 
 
 def _other_drive(drive_map: DriveMap, identity: Identity) -> ConfigError:

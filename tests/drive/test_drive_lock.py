@@ -43,6 +43,28 @@ def test_second_is_told_who_until_the_first_ends(tmp_path: Path, monkeypatch: py
     claim(second, NODE)
 
 
+@pytest.mark.parametrize("says", [True, False])
+def test_a_holder_that_has_not_said_who_it_is_is_waited_for(
+    says: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says so after it has the lock: of two downloads the second was told "unknown"."""
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path))
+    claim(connection(monkeypatch, 42), NODE)
+    (lock,) = (tmp_path / "locks").iterdir()
+    lock.write_text("")
+    second, waits = connection(monkeypatch, 42), []
+
+    def wait(seconds: float) -> None:
+        waits.append(seconds)
+        if says and len(waits) == 2:
+            lock.write_text("ada")
+
+    monkeypatch.setattr(second.clock, "wait", wait)
+    with pytest.raises(SecondMaster, match="this drive: ada" if says else "this drive: unknown"):
+        claim(second, NODE)
+    assert len(waits) == 2 if says else 0.1 < sum(waits) < 0.5
+
+
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("long", [False, True])
 def test_the_owner_of_a_lock_is_named_by_process_user_time_and_command(

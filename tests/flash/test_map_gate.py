@@ -149,8 +149,8 @@ def test_rows_that_a_drive_lacks_go_with_what_acts_only_with_them() -> None:
     with opened({**there, DriveObject(0x30A2, 1, "I"): 1}) as (_, connection):
         held = map_on(DriveNode(connection, NODE, drive_map=asked))
     assert list(held.cells) == ["motor.pole_pairs"] and map_hash(held) == map_hash(asked)
-    other_size = "the drive holds 2 bytes in 0x30A0:01, the map states UNSIGNED32"
-    no_object = "the drive has no object 0x3001:05"
+    other_size = "the drive holds 2 bytes in 0x30A0:01 (UNSIGNED32 in the map 'epos4', source 'being')"
+    no_object = "the drive has no object 0x3001:05 (UNSIGNED32 in the map 'epos4', source 'eds')"
     assert held.left_out["current.K_p_q_v_per_a"] == other_size
     assert held.left_out["current.K_i_q_v_per_as"] == f"not without current.K_p_q_v_per_a, and {other_size}"
     assert held.left_out["reference.K_t_nm_per_a"] == no_object

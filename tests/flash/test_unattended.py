@@ -77,6 +77,9 @@ class _Node:
     def state(self) -> State:
         return self._state
 
+    def other_axes(self) -> dict[int, State | None]:
+        return {}
+
     def get(self, item: object) -> float:
         assert item == POSITION
         self.looks += 1

@@ -470,7 +470,8 @@ def test_what_caps_says_is_written_is_written_where_the_drive_lacks_another_row(
     write_eds(Path("x.eds"), (*rows, (0x6081, 0, "U32", "rw", "1000"), (0x1010, 1, "U32", "rw", "1")))
     facts = json.loads(tool("caps", "--eds", "x.eds", "--json")[1])
     assert list(facts["written"]) == ["reference.profile_speed_rpm"]
-    assert facts["not_written"]["motor.pole_pairs"] == "the drive has no object 0x2350:03"
+    lacking = "the drive has no object 0x2350:03 (UNSIGNED16 in the map 'faulhaber', source 'poles')"
+    assert facts["not_written"]["motor.pole_pairs"] == lacking
     wanted = {"motor.pole_pairs": 2.0, "reference.profile_speed_rpm": 700.0}
     Path("set.toml").write_text(ParameterSet(wanted).to_toml())
     channel = "interior-2k2?nv=:memory:&eds=x.eds"
