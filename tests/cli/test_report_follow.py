@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import re
 import shutil
 import signal
@@ -18,7 +19,7 @@ from urllib.request import urlopen
 import pytest
 
 from pmsmtool.cli.main import run as program
-from pmsmtool.cli.report import RELOAD
+from pmsmtool.cli.report import NICENESS, RELOAD
 from pmsmtool.commissioning.design_stages import lut_stage
 from pmsmtool.design.lookup.design import LookupRequest
 from pmsmtool.files import data_folder
@@ -89,9 +90,13 @@ def test_the_page_follows_the_newest_run_as_its_files_come(tmp_path: Path) -> No
             assert process.wait(WAIT_S) == 0
 
 
-def test_a_run_is_followed_for_a_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = a_run(tmp_path, 3)
+def test_a_run_is_followed_for_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, given = a_run(tmp_path, 3), []
+    monkeypatch.setattr(os, "nice", given.append, raising=False)  # in this process every test after it would be slow
     assert program(["report", "--follow", str(run.path), "--for", "0.1s"]) == 0
+    assert given == [NICENESS], "what it follows goes first"
     assert capsys.readouterr().out.startswith("http://127.0.0.1:")
     assert program(["report", "--follow", str(tmp_path / "none")]) == 2
     assert "there is no such folder" in capsys.readouterr().err
