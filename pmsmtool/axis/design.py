@@ -223,8 +223,8 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     """Return a design of the axis, with the gains a drive holds where they follow better with the margins asked for.
 
     What is compared is the largest following error of one move: that of the loops, with the feed-forward that belongs
-    to the gains, and what Coulomb friction adds. Stored gains that follow better with
-    less margin than asked for are not kept. ``axis_stored_gains`` says what became of them.
+    to the gains, and what Coulomb friction adds. Stored gains that follow better with less margin than asked for are
+    not kept. ``axis_stored_gains`` says what became of them.
 
     ``stored``: what the drive holds, by catalogue name; without all gains of its controller nothing is compared.
     """

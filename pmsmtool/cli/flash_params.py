@@ -80,7 +80,7 @@ def flash_fleet(
     from pmsmtool.flash.download import Download, set_named
     from pmsmtool.flash.journal import JournalFolder
     from pmsmtool.flash.map_gate import check_nodes
-    from pmsmtool.flash.restore import marks_of, plan_download
+    from pmsmtool.flash.restore import marks_of, plan_download, tell_lacking
 
     _refuse_serial(motion)
     alone = _Unattended(serials, canary, wanted, drive_map) if serials is not None else None
@@ -112,17 +112,20 @@ def flash_fleet(
             job.admit(store=store)
         due = [job for job in jobs if job.has_work(store=store)]
         if alone is not None:
+            for job in jobs:
+                tell_lacking(job.node, job.plan)  # nobody reads the lists before
             alone.check(jobs, due, motion, out, lines)
         elif due:
             _ask(lines, due, bus, motion, out, store=store)
         results = _results(jobs, store=store, to_the_end=alone is None)
     rows = [_row(job, result) for job, result in zip(jobs, results, strict=True)]
     heads = ("node", "serial", "result", "written", "held already", "CRC-32", "repeated")
-    facts = [dict(zip(heads, row, strict=True)) for row in rows]
-    out.result("flash-params", {"nodes": plans, "results": facts}, lambda: table(heads, rows))
-    failures = [result for result in results if isinstance(result, PmsmtoolError)]
-    if failures:
-        raise failures[0]
+    facts = {"nodes": plans, "results": [dict(zip(heads, row, strict=True)) for row in rows]}
+    out.result("flash-params", facts, lambda: table(heads, rows))
+    if failed := next((result for result in results if isinstance(result, PmsmtoolError)), None):
+        raise failed
+    for job in jobs:
+        tell_lacking(job.node, job.plan)
 
 
 def _grouped(jobs: list[Download]) -> list[str]:

@@ -68,7 +68,7 @@ def tell_lacking(node: DriveNode, plan: Plan) -> None:
     ]
     if lacking:
         raise Partial(
-            f"{counted(len(lacking), 'value')} with a row in the map {node.map.name!r} could not be written",
+            f"{counted(len(lacking), 'value')} with a row in the map {node.map.name!r} left out on this drive",
             where=f"node {node.node}", missing=lacking,
             hint="correct the rows in a copy of the map for this drive, and give it with --map",
         )  # fmt: skip

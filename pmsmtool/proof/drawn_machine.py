@@ -42,8 +42,8 @@ FRICTION_FACTOR = 2.0
 """Factor either way where it gives them, and their standard deviation."""
 LAG_SHARES, LAG_S = (0.1, 0.65), 20e-6
 """Largest lag of the current sensors where it was not identified: that of amplifier and filter (s), within these shares
-of the control period. With a tenth of it a healthy drive (17 of 44 us) was 1.23 half widths of the delay off. Short
-ones are drawn more often."""
+of the control period. With a tenth of it a healthy drive (17 of 44 us) was 1.23 half widths of the delay off, with 0.4
+one of 19.4 us at 31 kHz (0.61 periods) 1.85. Short ones are drawn more often."""
 LATE_SHARE = 0.1
 """Latest sample of half of the drives where it was not identified (T_s). Beside an iron loss of 8 % one that is later
 than the sensor's lag has the current of the loss in it: the loop gain of a healthy drive seemed 6 % lower."""

@@ -65,6 +65,7 @@ SAME_SPEED, STARTS, LEAST_LEFT = 5e-3, 5, 0.2
 often it is started again for that: a light one loses a quarter of its speed, and how much depends on it. Of a faster
 start at least that share is left."""
 _WITHOUT_SEARCH = {FIELD_WEAKENING_MODES[name] for name in ("off", "lookup")}
+"""Field weakening whose d current follows the torque at once; the other modes come to it step by step."""
 RUN_IN = 4.0
 """A speed is held for this many time constants of the speed loop before a speed step."""
 HOLD = 6.0

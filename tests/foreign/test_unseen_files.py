@@ -464,7 +464,9 @@ def test_a_further_axis_that_stays_on_is_no_confirmed_stop(tool: Tool, word: str
 
 
 @pytest.mark.chain
-def test_what_caps_says_is_written_is_written_where_the_drive_lacks_another_row(tool: Tool) -> None:
+def test_what_caps_says_is_written_is_written_where_the_drive_lacks_another_row(
+    tool: Tool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A Faulhaber without a pole number: `flash-params` refused the set, `backup` ended with exit code 4."""
     rows = tuple(row for row in faulhaber() if row[0] != 0x2350)
     write_eds(Path("x.eds"), (*rows, (0x6081, 0, "U32", "rw", "1000"), (0x1010, 1, "U32", "rw", "1")))
@@ -479,6 +481,9 @@ def test_what_caps_says_is_written_is_written_where_the_drive_lacks_another_row(
     assert code == 10 and json.loads(said)["outcome"]["written"] == 1, told
     assert "not written: motor.pole_pairs: the drive has no object 0x2350:03" in told, "before the consent"
     assert tool("--sim", channel, "backup", "-o", "b.json")[0] == 0
+    monkeypatch.setattr("pmsmtool.cli.flash_params._ask", lambda *args, **options: None)
+    code, said, told = tool("--sim", channel, "flash-params", "set.toml", "--nodes", "1")
+    assert code == 10 and "PASS" in said and "motor.pole_pairs: the drive has no object 0x2350:03" in told
 
 
 def test_nothing_that_a_map_names_is_no_backup(tool: Tool) -> None:
