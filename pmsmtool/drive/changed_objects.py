@@ -30,6 +30,9 @@ FOLDER = "lent"
 _COMMANDS = frozenset({objects.MODE.index, 0x6071, 0x607A, 0x60FF})
 """The mode a drive wakes up with, which some take from nobody, and targets, which some take only while enabled: the
 drive is off by now."""
+OFTEN = 8
+"""An object that one run gives more values than these is a command: the record then says that it is lent, not what it
+holds. A file for every target torque was half the time of a run without PDO, and stood between two commands."""
 BUSY_S = 5.0
 """A drive that refuses because it is busy is asked again for so long."""
 
@@ -129,11 +132,13 @@ class ChangedObjects:
                 return  # cannot be read, so it cannot be restored; nothing the guard writes is of that kind
         if data and not self._node.map.staging:
             # before it is written: a program that is killed between leaves what was written last
-            self._lent[index, sub] = [*self._lent.get((index, sub), [])[-1:], data]
-            self._keep()
+            new = self._lent.get((index, sub))
+            if new is None or (new and data not in new):
+                self._lent[index, sub] = [*(new or ()), data] if len(new or ()) < OFTEN else []
+                self._keep()
 
     def _keep(self) -> None:
-        """Say in the drive's file what is lent; a killed process leaves it."""
+        """Say in the drive's file what is lent: old content and ours, the old alone of a command; a kill leaves it."""
         if (path := _path_of(self._drive.identity)) is not None:
             rows = {
                 f"{index:04X}:{sub:02X}": [data.hex() for data in (self._before[index, sub], *new)]
@@ -177,7 +182,7 @@ def restore_lent(node: DriveNode, identity: Identity, say: Callable[[str], None]
     refused: dict[str, list[str]] = {}
     for (name, index, sub), (old, new) in reversed(lent.items()):
         try:
-            if (held := node.sdo.read(index, sub)) in new and held != old:
+            if (held := node.sdo.read(index, sub)) != old and (held in new or not new):
                 node.sdo.download(index, sub, old)
                 count += 1
         except SdoAbort:

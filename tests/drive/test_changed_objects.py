@@ -15,7 +15,7 @@ import pytest
 from pmsmtool.bus.nmt import NmtState
 from pmsmtool.drive import heartbeat as beating
 from pmsmtool.drive import objects
-from pmsmtool.drive.changed_objects import ChangedObjects, any_lent, restore_lent
+from pmsmtool.drive.changed_objects import OFTEN, ChangedObjects, any_lent, restore_lent
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.motion_objects import MAX_TORQUE_PERMILLE, Quantity
@@ -82,6 +82,23 @@ def test_what_was_written_before_the_last_note_comes_back_too(
         node.before_write = None
         table.objects[0x6071, 0] = A.encode(held)
         assert restore_lent(node, LENT, print) == (held != 5) and node.get(A) == 5.0 and not any_lent()
+
+
+def test_an_object_that_is_commanded_again_and_again_is_recorded_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path))
+    kept: list[int] = []
+    keep = ChangedObjects._keep
+    monkeypatch.setattr(ChangedObjects, "_keep", lambda self: (kept.append(1), keep(self)))
+    with node_of({A: 5, B: 6, objects.STATUSWORD: 0x40}, GENERIC) as (_, node):
+        changed_of(node).begin()
+        for value in range(100, 300):
+            node.put(A, value)
+            node.put(B, 60 + value % 2)
+        node.before_write = None
+        assert len(kept) == OFTEN + 1 + 2
+        assert restore_lent(node, LENT, print) == 2 and (node.get(A), node.get(B)) == (5.0, 6.0) and not any_lent()
 
 
 def test_what_a_drive_refuses_to_take_back_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
