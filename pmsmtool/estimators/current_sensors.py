@@ -81,7 +81,7 @@ def estimate_noise(trace: Trace) -> Noise:
 
 
 MEAN_SAMPLES = 512
-"""Samples of a mean of a pair."""
+"""Samples of a mean of a pair, where a trace does not say."""
 LEAST = 0.002
 """Largest gain over the mean up to which nothing is corrected: leaves 0.1 % of R or L, a tenth of their tolerance."""
 SURE = 4.0
@@ -130,7 +130,7 @@ def estimate_mismatch(pairs: Trace, noise: Noise) -> SensorMismatch:
     inverse = np.linalg.pinv(rows)
     gains = inverse @ np.append(np.sum(steps, axis=1), 0.0)
     # three phases, each with sqrt(3/2) of the noise of an axis, at two levels
-    sum_std = noise.sigma_a * math.sqrt(1.5 * 3.0 * 2.0 / MEAN_SAMPLES)
+    sum_std = noise.sigma_a * math.sqrt(1.5 * 3.0 * 2.0 / int(pairs.meta.get("samples", MEAN_SAMPLES)))
     std = sum_std * float(np.max(np.linalg.norm(inverse[:, :3], axis=1)))
     return SensorMismatch((float(gains[0]), float(gains[1]), float(gains[2])), std)
 

@@ -25,7 +25,7 @@ STAGE = "phase check"
 CONNECTED_SIGMA = 10.0
 """Multiples of the noise of a mean that a current must exceed."""
 MEAN_SAMPLES = 512
-"""Samples of a mean."""
+"""Samples of a mean, where a trace does not say."""
 OPEN_FRACTION = 0.2
 """Fraction of the other phases' current below which a phase counts as open, and of the command all of them."""
 BALANCE_LIMIT = 0.10
@@ -177,7 +177,8 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
     ----------
     pairs : Trace
         Six rows, two currents with phase a, b and c idle in turn: ``i_a_a i_b_a i_c_a u_d_v i_d_a`` (means),
-        ``moved`` 1 where the rotor did not come to rest.
+        ``moved`` 1 where the rotor did not come to rest; ``u_d_change_v i_d_change_a`` from half to half of a window,
+        and ``meta["samples"]``, where they are known.
     noise : Noise
         From the zero-current trace.
     curve : InverterCurve
@@ -202,8 +203,13 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
     taken = np.diff(lost)[::2] / steps
     slopes = raw - taken
     # noise of a mean, seen through the slope at both ends; and legs that are not alike
-    sigma = MEAN_NOISE_FACTOR * noise.sigma_a * math.sqrt(2.0 / MEAN_SAMPLES) / float(np.min(np.abs(steps)))
-    limit = max(BALANCE_LIMIT * float(np.mean(slopes)), SLOPE_SIGMA * sigma * float(np.max(np.abs(raw))))
+    samples = int(pairs.meta.get("samples", MEAN_SAMPLES))
+    std = MEAN_NOISE_FACTOR * noise.sigma_a * math.sqrt(2.0 / samples) * float(np.max(np.abs(raw)))
+    if "u_d_change_v" in pairs.signals:  # ripple of a link: a mean of both halves has half of their difference
+        change = pairs["u_d_change_v"] - float(np.mean(raw)) * pairs["i_d_change_a"]
+        std = max(std, math.sqrt(0.5 * float(np.mean(change**2))))
+    std /= float(np.min(np.abs(steps)))
+    limit = max(BALANCE_LIMIT * float(np.mean(slopes)), SLOPE_SIGMA * std)
     limit += LEG_DOUBT * float(np.max(np.abs(taken)))
     difference = float(np.ptp(slopes))
     moved = "moved" in pairs.signals and float(np.max(pairs["moved"])) > 0.0
@@ -220,7 +226,7 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
     legs = [np.linalg.lstsq(np.stack(rows, axis=1), r, rcond=None)[0][1] for *rows, r in zip(
         i.reshape(3, 2), lost.reshape(3, 2), rest, strict=True
     )]  # fmt: skip
-    std = math.hypot(sigma * float(np.max(np.abs(raw))), float(np.ptp(legs)) * float(np.max(np.abs(taken))))
+    std = math.hypot(std, float(np.ptp(legs)) * float(np.max(np.abs(taken))))
     return PairCheck(resistances, mismatch, not moved, std)
 
 
