@@ -250,6 +250,8 @@ def main() -> None:
     parser.add_argument("--real", action="store_true", help="with effects of real machines (real_population.py)")
     parser.add_argument("--verbose", action="store_true", help="a line for every proof")
     asked = parser.parse_args()
+    if asked.declared and asked.real:
+        parser.error("what is declared has a rigid shaft and no iron loss: identify --real drives")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     setattr(proving, "predict_proof", Shared().predict)  # noqa: B010 - replaced on purpose
     refused = 0

