@@ -2,13 +2,23 @@
 """The current loop of the flux run against an inverter whose error is large beside the winding's voltage."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 from benchmarks.identification_coverage import drawn, evaluated, measured, truth_of
+from pmsmtool.drive.port import Halves
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
-from pmsmtool.experiments.speed_run import SETTLE_MOST_S, SETTLE_S, SteadyLoop, steady_loop
+from pmsmtool.experiments.speed_run import (
+    COAST_BAND,
+    SETTLE_MOST_S,
+    SETTLE_S,
+    SteadyLoop,
+    repeat_fastest_pair,
+    speeds_trace,
+    steady_loop,
+)
 from pmsmtool.identification.sampling import timing_estimates, timing_warnings
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.limits import Limits
@@ -94,6 +104,49 @@ def test_a_q_current_that_settles_slowly_does_not_stop_the_shaft() -> None:
     gains = SensorTolerance().impedance * evaluation.inductance.L_d.value
     expected = math.hypot(gains, latency)
     assert evaluation.inductance.L_d.systematic == pytest.approx(expected, rel=5e-3)  # measured 3.3e-3, by the R at T
+
+
+class Shaft:
+    """A shaft that coasts, or keeps its speed at a q current of ``KEEPING_A``; speed control ramps to a speed."""
+
+    period_s, KEEPING_A, FULL_RAD_S = 1e-4, 0.25, 600.0
+
+    def __init__(self, stops_s: float, ramp_s: float) -> None:
+        self.stops_s, self.ramp_s = stops_s, ramp_s
+        self.omega, self.i_a, self.asked_rad_s = 0.0, (0.0, 0.0), 0.0
+        self.controlled = False
+
+    def command_speed(self, speed: float) -> None:
+        self.controlled, self.asked_rad_s = True, speed
+
+    def command_current(self, i_d_a: float, i_q_a: float) -> None:
+        self.controlled, self.i_a = False, (i_d_a, i_q_a)
+
+    def wait(self, seconds: float) -> None:
+        if self.controlled:
+            self.omega = min(self.asked_rad_s, self.omega + self.FULL_RAD_S * seconds / self.ramp_s)
+        else:
+            slowing = self.FULL_RAD_S * (1.0 - self.i_a[1] / self.KEEPING_A) / self.stops_s
+            self.omega = max(0.0, self.omega - slowing * seconds)
+
+    def average(self, signals: Sequence[str], periods: int) -> dict[str, float]:
+        self.wait(periods * self.period_s)
+        shown = {"omega_e_rad_s": self.omega, "i_d_a": self.i_a[0], "i_q_a": self.i_a[1], "u_q_v": 0.2 * self.omega}
+        return {name: shown.get(name, 0.0) for name in signals}
+
+    def halves(self, signals: Sequence[str], periods: int) -> Halves:
+        return Halves(self.average(signals, periods), self.average(signals, periods), 2 * periods)
+
+
+@pytest.mark.parametrize(("stops_s", "kept_a", "ramp_s"), [(0.3, 0.25, 0.5), (5.0, 0.0, 0.5), (200.0, 0.0, 20.0)])
+def test_windows_after_a_map_have_the_speed_of_those_before(stops_s: float, kept_a: float, ramp_s: float) -> None:
+    """A light shaft stopped in them, and a heavy one had not reached its speed."""
+    shown = {"u_d_v": 0.0, "u_q_v": 120.0, "omega_e_rad_s": 600.0, "T_magnet_c": 20.0}
+    row = {**shown, "i_q_a": kept_a, "omega_first_rad_s": 600.0, "omega_second_rad_s": 600.0, "half_s": 0.03}
+    before = speeds_trace([{**row, "i_d_a": 1.0}, {**row, "i_d_a": -1.0}], {})
+    again = repeat_fastest_pair(Shaft(stops_s, ramp_s), before, 1)  # type: ignore[arg-type]
+    assert [part["i_d_a"] for part in again] == [1.0, -1.0]
+    assert all(part["omega_e_rad_s"] > (0.95 - COAST_BAND) * Shaft.FULL_RAD_S for part in again)
 
 
 def ripple_of(drive: MachineFile) -> float:
