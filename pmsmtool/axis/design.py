@@ -364,6 +364,9 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
     if unknown:
         swings = f"the shaft has play, or is not rigid: it may swing from {min(unknown):.3g} to {max(unknown):.3g} Hz"
         notes = (*notes, f"{swings}, and the loops keep their margins with all of that")
+    hertz = design.loops["current_q"].bandwidth_rad_s / (2.0 * math.pi)
+    counted = f"the margins count on a q current loop of {hertz:.3g} Hz, which the set of the axis does not write"
+    notes = (*notes, f"{counted}: `tune` without --axis designs it")
     if PROFILE[3] not in drive.offers and PROFILE[0] in drive.offers:
         notes = (*notes, "no object for the jerk (0x60A4): moves are trapezoids")
     how = f"stiffest with {request.phase_margin_deg:g} deg and |S| below {request.peak_db:g} dB over the tolerance box"

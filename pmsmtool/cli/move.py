@@ -84,7 +84,7 @@ def move_command(
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.commissioning.designed_move import foretold_move, limits_of_move
     from pmsmtool.design.design_file import load_design
-    from pmsmtool.drive.envelope import Envelope
+    from pmsmtool.drive.envelope import Envelope, largest_acceleration
     from pmsmtool.drive.guard import guarded
     from pmsmtool.drive.motion_objects import first_of_axes, held_current_limits, low_limits
     from pmsmtool.drive.own_limits import refuse_no_current
@@ -121,6 +121,7 @@ def move_command(
         envelope = Envelope(
             i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S * times, load=motion.load,
             travel_rad=TRAVEL_MARGIN * abs(way_rad), shaft=motion.shaft or "free", brake=motion.brake,
+            acceleration_rad_s2=None if made is None else largest_acceleration(made.machine.machine, i_max),
         )  # fmt: skip
         envelope.refuse_gravity()
         gains = drive.held_gains()
@@ -151,8 +152,7 @@ def move_command(
         out.note(f"changed for the move: {counts}")
     run.save(TRACE, trace_npz(trace))
     found = move_result(trace)
-    doubts = trace.meta["doubts"]
-    for line in doubts:
+    for line in (doubts := trace.meta["doubts"]):
         out.warn(line)
     values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]
     values += [{"name": name, "value": value, "unit": _unit(name)} for name, value in gains.items()]

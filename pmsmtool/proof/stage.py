@@ -257,12 +257,14 @@ def refuse_other_set(node: DriveNode, design: Design) -> None:
     """
     plan = plan_download(node, design.parameter_set())
     if plan.changes:
+        before = "`pmsmtool flash-params` of a set of `tune` without --axis, then DESIGN: its set holds the axis alone"
+        hint = before if design.request.get("axis") else "`pmsmtool flash-params DESIGN` first"
         raise VerifyMismatch(
             f"the drive does not hold this design: {len(plan.changes)} of {len(plan.entries)} objects differ",
             where=f"node {node.node}",
             differences=plan.lines()[: len(plan.changes)],
             likely="another design was flashed, or none",
-            hint="`pmsmtool flash-params DESIGN` first; nothing was moved",
+            hint=f"{hint}; nothing was moved",
         )
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import replace
 from functools import cache
@@ -81,6 +82,8 @@ def designed(family: str, f_a: float, f_r: float) -> Design:
 )
 def test_random_machines_of_the_box_keep_what_was_asked(family: str, f_a: float, f_r: float) -> None:
     made = designed(family, f_a, f_r)
+    hertz = made.loops["current_q"].bandwidth_rad_s / (2.0 * math.pi)
+    assert any(f"a q current loop of {hertz:.3g} Hz" in note for note in made.notes)
     drive = axis_drive(load_family(family))
     path, _ = axis_path(made, ASKED, drive, mechanics_of(made.machine))
     notch = Notch(made["speed.notch_hz"], made["speed.notch_zeta_num"], made["speed.notch_zeta_den"])

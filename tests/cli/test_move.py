@@ -276,6 +276,7 @@ def test_a_move_of_a_design_keeps_within_the_limit_in_force(tool: Tool) -> None:
     assert torque < 0.65 * load_machine_file("interior-2k2").machine.torque_nm(0.0, RATED_APK), "1.2 with I_max"
     foretold = json.loads(printed)["predicted"]
     assert "predicted following error: " in said and "deg with the gains of the design" in said  # no unit of held ones
+    assert "until then full torque" in said, "the design knows the inertia"
     error = json.loads(printed)["move"]["error_peak_rad"]
     assert foretold["error_least_rad"] < error < FORETOLD * foretold["error_most_rad"]
 

@@ -52,6 +52,7 @@ from pmsmtool.proof.stage import (
     prove_stage,
     rated_rpm,
     read_proof,
+    refuse_other_set,
     responses,
 )
 from pmsmtool.run_directory import RECORD, RunDirectory, Stage
@@ -472,7 +473,9 @@ def test_a_drive_that_holds_another_set_is_refused(design: Design) -> None:
         drive.write({"current.K_p_d_v_per_a": 0.9 * design["current.K_p_d_v_per_a"]})
         with pytest.raises(VerifyMismatch, match=r"1 of \d+ objects differ") as caught:
             prove(drive, design)
-        assert "flash-params" in str(caught.value) and "K_p_d" in str(caught.value)
+        assert "`pmsmtool flash-params DESIGN` first" in str(caught.value) and "K_p_d" in str(caught.value)
+        with pytest.raises(VerifyMismatch, match="`tune` without --axis"):  # its own set would never be enough
+            refuse_other_set(drive.node, replace(design, request={**design.request, "axis": True}))
         assert not list(Path("runs").glob("*/prove"))
 
 
