@@ -111,6 +111,11 @@ class Quantity:
         """Return the quantity that a deviation from the mean shows."""
         return self.nominal + sum(float(np.vdot(weights, deviation[key])) for key, weights in self.signature.items())
 
+    @property
+    def band(self) -> str:
+        """The predicted band with its unit, as a person reads it."""
+        return f"{self.low:.3g} to {self.high:.3g}{'' if self.unit == '1' else f' {self.unit}'}"
+
 
 @dataclass(frozen=True, slots=True)
 class Fault:

@@ -135,7 +135,7 @@ class Derived:
     """A derived quantity.
 
     Which experiments show it (begin of their names), two sets of runs that differ in it (empty: the healthy drive) with
-    their values, its nominal value, and its least half width over their difference.
+    their values, its nominal value, its least half width over their difference, and its unit.
     """
 
     shown_by: tuple[str, ...]
@@ -145,16 +145,19 @@ class Derived:
     at_low: float
     nominal: float
     least: float = LEAST_CHANGE
+    unit: str = "1"
 
 
 STEPS, MOVES = ("q_", "d_"), ("move",)
 QUANTITIES: Mapping[str, Derived] = {
     "loop gain over the designed one": Derived(STEPS, "gain_high", 1.25, "gain_low", 0.8, 1.0),
-    "delay beyond the designed one": Derived(STEPS, "delay", 1.0, "", 0.0, 0.0),
+    "delay beyond the designed one": Derived(STEPS, "delay", 1.0, "", 0.0, 0.0, unit="control periods"),
     "decoupling over the designed one": Derived(STEPS, "", 1.0, "decoupling", -1.0, 1.0),
     "position gain over the designed one": Derived(MOVES, "position_gain_high", 1.25, "position_gain_low", 0.8, 1.0),
     "speed gain over the designed one": Derived(MOVES, "speed_gain_high", 1.25, "speed_gain_low", 0.8, 1.0),
-    "age of the angle beyond the designed one": Derived(MOVES, "late_angle", 1.0, "", 0.0, 0.0, AGE_LEAST),
+    "age of the angle beyond the designed one": Derived(
+        MOVES, "late_angle", 1.0, "", 0.0, 0.0, AGE_LEAST, "periods of the speed loop"
+    ),
 }
 
 

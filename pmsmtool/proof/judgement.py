@@ -241,8 +241,7 @@ def _cause_of_quantities(prediction: Prediction, deviation: Mapping[tuple[str, s
 def _seen_quantity(name: str, quantity: Quantity, value: float) -> Seen:
     middle, half = 0.5 * (quantity.low + quantity.high), 0.5 * (quantity.high - quantity.low)
     share = abs(value - middle) / half if math.isfinite(value) else math.inf
-    unit = "" if quantity.unit == "1" else f" {quantity.unit}"
-    return Seen(name, share, f"{value:.3g}{unit}, {quantity.low:.3g} to {quantity.high:.3g} predicted")
+    return Seen(name, share, f"{value:.3g}, {quantity.band} predicted")
 
 
 def likely_cause(

@@ -326,7 +326,7 @@ def predict_proof(
         high, low = (_judged(shown, wrong[fault] if fault else few) for fault in (derived.high, derived.low))
         below, above = (DEFECTS[fault].text if fault else "" for fault in (derived.low, derived.high))
         directions[name] = Direction(
-            derived.nominal, "1", high, low, derived.at_high, derived.at_low, below, above, derived.least
+            derived.nominal, derived.unit, high, low, derived.at_high, derived.at_low, below, above, derived.least
         )  # fmt: skip
     return predict(
         {e.name: np.arange(e.pattern_rows, dtype=np.float64) * (T_s * e.decimation) for e in plan.experiments},

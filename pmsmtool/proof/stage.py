@@ -293,7 +293,7 @@ def band_lines(prediction: Prediction) -> list[str]:
             f"predicted {experiment} {signal}: {float(band.mean.min()):.4g} to {float(band.mean.max()):.4g}, "
             f"95 % within +-{float(np.median(band.half)):.2g} (median), +-{float(band.half.max()):.2g} (largest)"
         )
-    lines += [f"predicted {name}: {q.low:.3g} to {q.high:.3g}" for name, q in prediction.quantities.items()]
+    lines += [f"predicted {name}: {quantity.band}" for name, quantity in prediction.quantities.items()]
     return lines
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 import signal
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -140,6 +141,7 @@ def test_a_healthy_drive_passes_and_the_prediction_came_first(design: Design) ->
     assert stage.status == "pass", stage.note
     ((digest, until),) = committed
     assert f"prediction committed: sha256:{digest}" in until and "predicted q_steps i_q_a" in until
+    assert re.search(r"predicted delay beyond the designed one: \S+ to \S+ control periods$", until, re.MULTILINE)
     assert {"name": "prediction", "value": f"sha256:{digest}"} in stage.values
     (folder,) = (run.path / "prove").iterdir()
     assert hashlib.sha256((folder / "prediction.npz").read_bytes()).hexdigest() == digest, "the file is as committed"
