@@ -38,7 +38,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
     CiA 402. The intervals were measured on simulated drives of the same capability level; where none was measured, none
     is printed.
 
-    With --eds no bus is needed: a simulated drive with the objects of the file is read, with a motor set up in it.
+    With --eds no bus is needed: a simulated drive with the objects of the file is asked, with a motor set up in it.
     """
     from pmsmtool.drive_maps.shipped_maps import GENERIC, kin_of
     from pmsmtool.flash.map_gate import other_drive, unknown_firmware

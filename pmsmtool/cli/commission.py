@@ -151,7 +151,7 @@ def commission_command(
         raise ConfigError("MACHINE and --resume exclude each other", hint="a run keeps the machine it began with")
     known = machine if begun is None else _kept_nameplate(begun)
     limits = motion if begun is None else _limits_as_begun(motion, begun)
-    asked = _asked(known, limits, sensor_tol, flux_map, design)
+    asked = _asked(known, eds, limits, sensor_tol, flux_map, design)
     if begun is not None:
         bus = _as_begun(bus, begun)
     elif bus.simulated():
@@ -226,13 +226,13 @@ def _limits_as_begun(motion: MotionOptions, run: RunDirectory) -> MotionOptions:
 
 
 def _asked(
-    machine: Path | None, motion: MotionOptions, sensor_tol: float, flux_map: bool, design: dict[str, Any]
+    machine: Path | None, eds: str | None, motion: MotionOptions, sensor_tol: float, flux_map: bool, design: Any
 ) -> dict[str, Any]:
     """Check and collect what is asked of the chain, before anything is opened."""
     from pmsmtool.design.tune_request import TuneRequest
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.identification.request import QUANTITIES, IdentifyRequest
-    from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.sim.foreign.drive import rehearsed_motor
 
     wanted = IdentifyRequest(
         quantities=(*QUANTITIES, "map") if flux_map else QUANTITIES,
@@ -247,7 +247,7 @@ def _asked(
     )
     wanted.check()
     return {
-        "nameplate": None if machine is None else load_machine_file(machine),
+        "nameplate": None if machine is None else rehearsed_motor(machine, eds),
         "identify": wanted,
         "tune": TuneRequest(**design),
     }

@@ -2,7 +2,7 @@
 """Proof of the dead-man: the drive stops by itself when the tool dies.
 
 Nothing moves before this was shown: the consumer heartbeat time 0x1016 is set, node guarding (0x100C, 0x100D) where
-there is none, or the time within which a PDO is expected (0x1400:05) where that is missing, too; abort connection
+that cannot be, or the time within which a PDO is expected (0x1400:05) where that is missing, too; abort connection
 option 0x6007 and quick stop option 0x605A are set to remove the voltage where the drive has them and takes that (a ramp
 runs a speed loop which nobody has proven yet), the drive is enabled at zero current, the tool's heartbeat is stopped,
 and the voltage must be off within the declared time: by the state, as bit 4 of the statusword shows the supply, not the
@@ -38,6 +38,7 @@ STALLED_S = 0.05
 ANSWER_S = 0.2
 """A remote frame is answered within this time: a round trip takes milliseconds."""
 ABSENT = (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX)
+NO_CONSUMER = "the drive has no consumer heartbeat (0x1016)"
 _POLL_S = 0.005
 _STOPPING = (AbortConnection.FAULT, AbortConnection.DISABLE_VOLTAGE, AbortConnection.QUICK_STOP)
 
@@ -122,10 +123,11 @@ def prove_dead_man(drive: CanopenDrive, heartbeat: Heartbeat) -> DeadManProof:
         The tool's; it runs on return.
     """
     node = drive.node
-    if not (_set_consumer(drive) or _set_guarding(drive, heartbeat) or _set_process_data(drive, heartbeat)):
+    lacking = _set_consumer(drive)
+    if lacking and not (_set_guarding(drive, heartbeat) or _set_process_data(drive, heartbeat)):
         raise _refused(
-            "the drive has neither a consumer heartbeat (0x1016) nor node guarding (0x100C, 0x100D), and expects no "
-            "process data (0x1400:05): it would not notice that the tool died", drive,
+            f"{lacking}; there is no node guarding (0x100C, 0x100D), and the drive expects no process data "
+            "(0x1400:05): it would not notice that the tool died", drive,
         )  # fmt: skip
     abort_option = _abort_option(drive)
     quick_stop = set_quick_stop(node, QuickStop.DISABLE)
@@ -211,9 +213,16 @@ def _stop_and_measure(
         drive.node.connection.wait(_POLL_S)
 
 
-def _set_consumer(drive: CanopenDrive) -> bool:
-    """Make the drive watch the tool's heartbeat, in its own entry of 0x1016 or a free one; False where it cannot."""
+def _set_consumer(drive: CanopenDrive) -> str:
+    """Make the drive watch the tool's heartbeat, in its own entry of 0x1016 or a free one.
+
+    Returns
+    -------
+    str
+        Why it does not; empty where it does.
+    """
     node = drive.node
+    word = (TOOL_NODE << 16 | CONSUMER_MS).to_bytes(4, "little")
     try:
         count = node.sdo.read(objects.CONSUMER_HEARTBEAT, 0, size=1)[0]
         entries = {
@@ -222,19 +231,14 @@ def _set_consumer(drive: CanopenDrive) -> bool:
         }
         free = [sub for sub, word in entries.items() if word >> 16 & 0xFF in (TOOL_NODE, 0)]
         if not free:
-            raise _refused("all entries of the consumer heartbeat time are taken", drive)
+            return "all entries of the consumer heartbeat time (0x1016) are taken"
         free.sort(key=lambda sub: entries[sub] >> 16 & 0xFF != TOOL_NODE)
-        word = (TOOL_NODE << 16 | CONSUMER_MS).to_bytes(4, "little")
         if entries[free[0]] == int.from_bytes(word, "little"):  # left by a run that was killed, not the owner's
             node.sdo.download(objects.CONSUMER_HEARTBEAT, free[0], bytes(4))
         node.write_bytes(objects.CONSUMER_HEARTBEAT, free[0], word)
     except SdoAbort as abort:
-        if abort.code in ABSENT:
-            return False
-        raise _refused(
-            "the consumer heartbeat (0x1016) cannot be written: the drive would not notice that the tool failed", drive
-        ) from abort
-    return True
+        return NO_CONSUMER if abort.code in ABSENT else "the consumer heartbeat (0x1016) cannot be written"
+    return ""
 
 
 def _set_guarding(drive: CanopenDrive, heartbeat: Heartbeat) -> bool:
@@ -257,7 +261,7 @@ def _set_guarding(drive: CanopenDrive, heartbeat: Heartbeat) -> bool:
     node.connection.request(HEARTBEAT_ID + node.node, 1)
     if not node.connection.wait_until(lambda: node.supervision.nmt_state is not None, ANSWER_S):
         raise _refused(
-            "the drive has no consumer heartbeat (0x1016), and does not answer the remote frames of node guarding",
+            "without a consumer heartbeat (0x1016), the drive does not answer the remote frames of node guarding",
             drive, likely="the adapter sends no remote frames, or the drive's guarding is switched off",
         )  # fmt: skip
     _start(node)

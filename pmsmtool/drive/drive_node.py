@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from pmsmtool.bus.abort_codes import AbortCode
+from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.nmt import NmtCommand, NmtState, reset_node, send_nmt
 from pmsmtool.bus.sdo import Retry, SdoChannel
@@ -125,6 +126,20 @@ class DriveNode:
             return None
         self._lengths[item.index, item.sub] = len(data)
         return found.decode(data)
+
+    def takes(self, item: DriveObject, *values: float) -> bool:
+        """Whether an object takes values, and its own. On virtual time they are written; a real drive is only read."""
+        held = self.held(item)
+        if held is None or not isinstance(self.connection.clock, VirtualClock):
+            return held is not None
+        try:
+            for value in (*values, held):
+                self.put(item, value)
+        except (SdoAbort, NotAvailable):
+            with contextlib.suppress(SdoAbort):
+                self.put(item, held)
+            return False
+        return True
 
     def whole(self, item: DriveObject) -> int:
         """Return the whole number in an object."""

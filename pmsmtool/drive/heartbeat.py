@@ -147,7 +147,7 @@ def event_timer(number: int) -> DriveObject:
 
 def expects_pdos(node: DriveNode) -> bool:
     """Whether the drive has such a time for any of its receive PDOs."""
-    return any(node.has(event_timer(number).index, 5) for number in NUMBERS)
+    return any(node.takes(event_timer(number)) for number in NUMBERS)
 
 
 def expect_pdo(node: DriveNode, within_ms: float) -> int | None:

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive import objects
@@ -35,7 +36,7 @@ from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.recorders.reference import Recorder
 from pmsmtool.drive_maps.drive_map import DriveMap
-from pmsmtool.errors import DriveTimeout, NotAvailable
+from pmsmtool.errors import DriveTimeout, NotAvailable, SdoAbort
 from pmsmtool.trace import Trace
 from pmsmtool.units import RAD_S_PER_MRPM
 
@@ -53,6 +54,7 @@ QUARTER_TURN = 0.5 * math.pi
 """Torque current flows a quarter turn ahead of the commutation angle; the rotor's d axis settles there."""
 
 
+OUT_OF_RANGE = (AbortCode.VALUE, AbortCode.VALUE_HIGH, AbortCode.VALUE_LOW)
 MOST_STEP, STEP_S = 0.1, 1e-3
 """A target that the drive takes at once moves by this share of the rated current in this time: CST has no 0x6087."""
 
@@ -226,10 +228,22 @@ class TorqueCurrent(CanopenDrive):
         first = self._asked_a
         for step in range(1, steps + 1):
             asked = first + (i_q_a - first) * step / steps
-            self.node.put(self.target.quantity.item, round(asked / self.target.quantity.per_count))
+            self._put_target(round(asked / self.target.quantity.per_count))
             self._asked_a = asked
             if step < steps:
                 self.node.connection.wait(self._step_s)
+
+    def _put_target(self, counts: int) -> None:
+        """Write a target; raises NotAvailable: the drive takes none so large."""
+        try:
+            self.node.put(self.target.quantity.item, counts)
+        except SdoAbort as abort:
+            if abort.code not in OUT_OF_RANGE:
+                raise
+            raise NotAvailable(
+                f"the drive takes no target of {counts} ({abort.what})", where=abort.where,
+                hint="give a smaller --i-max, or raise the drive's limit with the maker's software",
+            ) from abort  # fmt: skip
 
 
 class RecorderDrive(TorqueCurrent):

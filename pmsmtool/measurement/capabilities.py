@@ -8,6 +8,7 @@ nothing is said.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -30,7 +31,7 @@ from pmsmtool.drive.motion_objects import (
     undecided,
     watched_by_tool,
 )
-from pmsmtool.drive.objects import SUPPORTED_MODES, DriveObject
+from pmsmtool.drive.objects import CONSUMER_HEARTBEAT, GUARD_TIME_MS, LIFE_TIME_FACTOR, SUPPORTED_MODES, DriveObject
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.recorders.choice import described
 from pmsmtool.drive.set_point import FOLLOWING_ERROR, POSITION_DEMAND, TARGET_POSITION
@@ -330,6 +331,7 @@ class Capabilities:
         return f"{NOT_TOLD}: {'; '.join(lacking)}"
 
 
+CONSUMER = DriveObject(CONSUMER_HEARTBEAT, 1, "I")
 _HALL = BY_NAME["hall.commutation"]
 HALL_COMMUTATION = DriveObject(_HALL.index, _HALL.sub, "B")
 UNDECIDED = "no source says whether its amperes are peak or rms: +-17 % more"
@@ -370,7 +372,7 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     node.map = drive_map = map_on(node) if named else node.map
     modes = _modes(node)
     has = {
-        "heartbeat": node.has(0x1016, 1),
+        "heartbeat": node.has(0x1016, 1) if drive_map.staging else node.takes(CONSUMER),
         "abort option": node.has(0x6007, 0),
         "quick stop": node.has(0x605A, 0),
         "limits": all(node.has(index, 0) for index in (0x6073, 0x6075, 0x6080)),
@@ -382,7 +384,8 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
     rated = None if drive_map.staging else _told(lambda: rated_apk(node))
     if not drive_map.staging:
         has |= _motion(node, rated) | {"encoder": True, "frame": True}
-        has["supervision"] = has["heartbeat"] or (node.has(0x100C, 0) and node.has(0x100D, 0)) or expects_pdos(node)
+        guarding = node.takes(GUARD_TIME_MS) and node.takes(LIFE_TIME_FACTOR)
+        has["supervision"] = has["heartbeat"] or guarding or expects_pdos(node)
     else:  # only then these objects are what the reference drive has there
         there = node.has(HALL_COMMUTATION.index, HALL_COMMUTATION.sub)
         halls = node.whole(HALL_COMMUTATION) if there else 0
@@ -414,7 +417,9 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
 def _motion(node: DriveNode, rated: float | None) -> dict[str, bool]:
     """Ask a drive of another maker for what motion needs: the standard's objects, else those its map names."""
     base = rated or 1.0
-    torque = _told(lambda: torque_target(node, base)) is not None
+    target = _told(lambda: torque_target(node, base).quantity)
+    counts = math.floor(base / target.per_count) if target is not None else 0
+    torque = target is not None and node.takes(target.item, counts, -counts)
     units = _told(lambda: position_units(node)) or 0.0
     return {
         "rated current": rated is not None,
@@ -424,7 +429,7 @@ def _motion(node: DriveNode, rated: float | None) -> dict[str, bool]:
         "torque mode": torque,
         "push": torque or _told(lambda: limited_speed(node)) is not None,
         "profile position": bool(_modes(node) & _bit(Mode.PROFILE_POSITION))
-        and node.held(TARGET_POSITION) is not None
+        and node.takes(TARGET_POSITION)
         and any(node.held(item) is not None for item in (POSITION_DEMAND, FOLLOWING_ERROR)),
     }
 

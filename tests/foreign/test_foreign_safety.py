@@ -41,6 +41,7 @@ from tests.foreign.data_sheets import (
     epos4,
     faulhaber,
     identity,
+    unknown,
     write_eds,
 )
 
@@ -74,12 +75,13 @@ class Rig:
 
 
 @contextmanager
-def opened(path: Path, rows: tuple[Row, ...], family: str = "") -> Iterator[Rig]:
-    eds = write_eds(path / "drive.eds", rows)
+def opened(
+    path: Path, rows: tuple[Row, ...], family: str = "", limits: dict[tuple[int, int], tuple[int, int]] | None = None
+) -> Iterator[Rig]:
+    eds = write_eds(path / "drive.eds", rows, limits)
     with connect("pmsmsim", f"interior-2k2?nv=:memory:&eds={eds}") as connection:
         node = cast(Node, connection.bus.line.nodes[0])  # type: ignore[attr-defined]
-        drive_map = load_family(family) if family else family_of(*node.identity[:2])
-        assert drive_map is not None
+        drive_map = load_family(family) if family else family_of(*node.identity[:2]) or load_family("cia402")
         drive = pushing_drive(connection, 1, drive_map)
         yield Rig(drive, node)
         drive.close()
@@ -101,6 +103,24 @@ def test_node_guarding_is_proven_where_there_is_no_heartbeat(tmp_path: Path) -> 
         assert [key for key, data in rig.memory().items() if data != before[key]] == []
 
 
+FIXED_HEARTBEAT: tuple[Row, ...] = ((0x1016, 1, "U32", "ro", "0"),)
+"""A consumer heartbeat time that nobody sets over the bus."""
+
+
+def test_a_heartbeat_that_cannot_be_set_leaves_node_guarding(tmp_path: Path) -> None:
+    with opened(tmp_path, (*copley(), *FIXED_HEARTBEAT)) as rig, guarded(rig.drive, ENVELOPE) as guard:
+        assert guard.proof is not None and guard.proof.by == "node guarding"
+
+
+def test_a_target_beyond_what_the_drive_takes_is_not_available(tmp_path: Path) -> None:
+    """Refused in the middle of a push: the voltage is off, and the limit is named instead of an abort code."""
+    with opened(tmp_path, unknown(), limits={(0x6071, 0): (-100, 100)}) as rig:
+        with pytest.raises(NotAvailable, match="takes no target of"), guarded(rig.drive, ENVELOPE) as guard:
+            guard.enable()
+            guard.command_current(0.0, 2.0)
+        assert rig.was_on and rig.off_since is not None
+
+
 FIXED_PDO: tuple[Row, ...] = ((0x1400, 2, "U8", "rw", "255"), (0x1400, 5, "U16", "rw", "100"))
 """A receive PDO that is expected, but carries what it carries."""
 
@@ -110,10 +130,10 @@ def unwatched(*more: Row) -> tuple[Row, ...]:
     return (*(row for row in copley() if row not in GUARDING), *more)
 
 
-@pytest.mark.parametrize("more", [(), FIXED_PDO])
+@pytest.mark.parametrize("more", [(), FIXED_PDO, FIXED_HEARTBEAT])
 def test_a_drive_without_any_supervision_is_refused(tmp_path: Path, more: tuple[Row, ...]) -> None:
     with opened(tmp_path, unwatched(*more)) as rig:
-        with pytest.raises(SafetyRefusal, match="neither a consumer heartbeat"), guarded(rig.drive, ENVELOPE):
+        with pytest.raises(SafetyRefusal, match="there is no node guarding"), guarded(rig.drive, ENVELOPE):
             pass
         assert not rig.was_on
 

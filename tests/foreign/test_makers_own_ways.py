@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.drive_maps.eds import parse_eds
-from pmsmtool.machine.machine_file import machine_path
+from pmsmtool.machine.machine_file import load_machine_file, machine_path
+from pmsmtool.sim.foreign.drive import assumptions_of, rehearsed_motor
 from pmsmtool.sim.foreign.families import encoder_resolution
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from tests.cli.conftest import Tool
@@ -99,6 +100,18 @@ def test_what_the_drive_cannot_hold_is_said(tool: Tool) -> None:
     rows = tuple(row for row in faulhaber() if row[0] != 0x608F)
     code, said = commissioned(tool, (*rows, (0x608F, 1, "U32", "rw", "2048")), {(0x608F, 1): (1, 65535)})
     assert code == 10 and "x.eds: 0x608F:01 cannot hold this motor's 131072" in said, said
+
+
+def test_a_motor_is_rehearsed_without_an_encoder_that_the_drive_cannot_count(tmp_path: Path) -> None:
+    """A drive with an encoder of its own: before, the rehearsal ended FAIL, "correct [encoder] bits"."""
+    rows = tuple(row for row in faulhaber() if row[0] != 0x608F)
+    fixed = write_eds(tmp_path / "fixed.eds", (*rows, (0x608F, 1, "U32", "ro", "3000")))
+    free = write_eds(tmp_path / "free.eds", (*rows, (0x608F, 1, "U32", "rw", "3000")))
+    stated = machine_path(PROFILE)
+    assert rehearsed_motor(stated, str(free)) == rehearsed_motor(stated, None)
+    assert rehearsed_motor(stated, None).encoder.bits == 17 and rehearsed_motor(stated, str(fixed)).encoder.bits is None
+    told = assumptions_of(str(fixed), load_machine_file(stated))
+    assert any("0x608F stays 3000 / 1, this motor's encoder has 131072" in line for line in told)
 
 
 def test_a_limit_that_only_takes_is_no_limit(tool: Tool) -> None:

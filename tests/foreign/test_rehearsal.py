@@ -34,15 +34,17 @@ from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.run_directory import Stage
 from pmsmtool.sim.channel import parse_channel
-from tests.foreign.data_sheets import GUARDING, Row, copley, epos4, write_eds
+from tests.foreign.data_sheets import GUARDING, Row, copley, epos4, unknown, write_eds
 
 
 def run(*arguments: str) -> Result:
     return CliRunner().invoke(cli, [*arguments])
 
 
-def asked(path: Path, rows: tuple[Row, ...]) -> dict[str, object]:
-    outcome = run("caps", "--eds", str(write_eds(path / "my drive&co.eds", rows)), "--json")
+def asked(
+    path: Path, rows: tuple[Row, ...], limits: dict[tuple[int, int], tuple[int, int]] | None = None
+) -> dict[str, object]:
+    outcome = run("caps", "--eds", str(write_eds(path / "my drive&co.eds", rows, limits)), "--json")
     assert outcome.exit_code == 0, outcome.exception
     facts: dict[str, object] = json.loads(outcome.stdout)
     return facts
@@ -72,6 +74,22 @@ def test_without_supervision_nothing_is_moved(tmp_path: Path) -> None:
     facts = asked(tmp_path, tuple(row for row in copley() if row not in GUARDING))
     assert facts["level"] == "manual"
     assert "consumer heartbeat (0x1016), or node guarding (0x100C, 0x100D)" in str(ways(facts)["psi", "standard"])
+
+
+@pytest.mark.parametrize(
+    ("row", "limits"),
+    [
+        ((0x1016, 1, "U32", "ro", "0"), None),
+        ((0x6071, 0, "I16", "ro", "0"), None),
+        ((0x6071, 0, "I16", "rw", "0"), {(0x6071, 0): (-100, 100)}),
+    ],
+)
+def test_what_a_push_writes_and_the_file_does_not_let_be_written_is_missing(
+    tmp_path: Path, row: Row, limits: dict[tuple[int, int], tuple[int, int]] | None
+) -> None:
+    """Found by writing to the simulated drive; before, the promise was broken by the first push."""
+    assert ways(asked(tmp_path, unknown()))["mechanics", "standard"]["available"]
+    assert not ways(asked(tmp_path, unknown("0x2D", row), limits))["mechanics", "standard"]["available"]
 
 
 def test_a_rehearsal_is_a_channel_of_the_simulated_bus(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from pmsmtool.errors import NotAvailable
 from pmsmtool.machine.machine_file import machine_path
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.foreign import families
+from pmsmtool.sim.foreign.drive import assumptions_of
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from pmsmtool.sim.node.dictionary import Entry
 from tests.cli.conftest import Tool
@@ -95,11 +96,24 @@ def test_a_stored_value_that_its_type_cannot_hold_is_cut(tmp_path: Path, row: Ro
     assert entry.integer() == value or int.from_bytes(entry.value, "little") == value
 
 
-def test_a_mandatory_object_that_is_no_number_is_the_standards(tmp_path: Path) -> None:
-    rows = [row for row in epos4() if row[0] != 0x6502] + [(0x6502, 0, "VSTR", "ro", "modes")]
-    objects = read_makers_objects(str(write_eds(tmp_path / "x.eds", rows)))
-    assert objects.rows[0x6502, 0].type == "U32" and objects.stored(0x6502) == 0
-    assert any(line.startswith("0x6502:00 is U32") for line in objects.assumed)
+@pytest.mark.parametrize(
+    ("row", "kind", "access"),
+    [
+        ((0x6502, 0, "VSTR", "ro", "modes"), "U32", "ro"),
+        ((0x6041, 0, "U8", "ro", "0"), "U16", "ro"),
+        ((0x6041, 0, "U16", "wo", "0"), "U16", "ro"),
+        ((0x6040, 0, "U16", "const", "0"), "U16", "rw"),
+    ],
+)
+def test_a_mandatory_object_that_cannot_be_so_is_the_standards(
+    tmp_path: Path, row: Row, kind: str, access: str
+) -> None:
+    """A status word of one byte, or one that cannot be read, is a mistake of the file, and said so."""
+    rows = [each for each in epos4() if each[0] != row[0]] + [row]
+    path = str(write_eds(tmp_path / "x.eds", rows))
+    found = read_makers_objects(path).rows[row[0], 0]
+    assert (found.type, found.access) == (kind, access)
+    assert any(line.startswith(f"0x{row[0]:04X}:00 is ") and "the standard" in line for line in assumptions_of(path))
 
 
 def test_files_differ_and_follow_from_their_seed(sources: list[str]) -> None:

@@ -12,6 +12,7 @@ import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
@@ -19,7 +20,15 @@ from pmsmtool.bus.clock import Schedule, Timer
 from pmsmtool.errors import ConfigError
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
-from pmsmtool.sim.foreign.families import Law, assumed_modes, family_of, laws_of, modes_of, units_of
+from pmsmtool.sim.foreign.families import (
+    Law,
+    assumed_modes,
+    encoder_resolution,
+    family_of,
+    laws_of,
+    modes_of,
+    units_of,
+)
 from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects, read_makers_objects
 from pmsmtool.sim.foreign.position import PositionLoop
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
@@ -99,6 +108,9 @@ class ForeignDrive:
             for law in self.laws.values()
             if law.set_up is not None and not _holds(objects.rows[law.index, law.sub], law.set_up)
         ]
+        if not _holds_encoder(objects, set_up):
+            counted = f"{encoder_resolution(objects, set_up.counts):.0f} / {max(1, objects.stored(0x608F, 2))}"
+            unheld.append(f"0x608F stays {counted}, this motor's encoder has {set_up.counts}: that is not compared")
         if set_up != stated_motor:
             unheld.append(f"rated current cut to the drive's {set_up.i_nom_apk:.4g} A peak")
         self.unheld = tuple(unheld)
@@ -213,6 +225,22 @@ def assumptions_of(file: str, machine_file: MachineFile | None = None) -> tuple[
         (f"0x6502 is blank: modes {modes} are assumed by its objects; a real drive reports its own",) if assumed else ()
     )
     return (*lines, *(() if machine_file is None else ForeignDrive(objects, set_up_of(machine_file)).unheld))
+
+
+def rehearsed_motor(path: Path, file: str | None) -> MachineFile:
+    """Return a machine file, without the encoder where the drive of a file cannot be set up for it: it has its own."""
+    from pmsmtool.machine.machine_file import load_machine_file
+
+    motor = load_machine_file(path)
+    if file is None or _holds_encoder(read_makers_objects(file), set_up_of(motor)):
+        return motor
+    return replace(motor, encoder=replace(motor.encoder, bits=None))
+
+
+def _holds_encoder(objects: MakersObjects, set_up: SetUp) -> bool:
+    """Whether the drive counts the encoder that the motor has."""
+    counts = encoder_resolution(objects, set_up.counts) / max(1, objects.stored(0x608F, 2))
+    return not objects.has((0x608F, 1)) or counts == set_up.counts
 
 
 def _within(objects: MakersObjects, set_up: SetUp) -> SetUp:

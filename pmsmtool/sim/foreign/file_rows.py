@@ -123,7 +123,7 @@ def _read(data: bytes, where: str) -> MakersObjects:
         found, label, odd = dict(_of_eds(data, eds)), path.stem, _first_of(eds.warnings, f"{path}:")
     has_words = all((word, 0) in found and (word, 1) not in found for word in (0x6040, 0x6041))  # no records
     stated = MakersObjects(label, found, ()).stored(0x1000) & 0xFFFF  # by the file itself
-    rows, assumed = _completed(found)
+    rows, assumed, corrected = _completed(found)
     if stated != DRIVE_PROFILE and (stated in PROFILES or not has_words):
         named = f"of a device of profile {stated}" if stated else "of a device without control and status word (0x6040)"
         raise ConfigError(
@@ -132,7 +132,7 @@ def _read(data: bytes, where: str) -> MakersObjects:
             likely="a controller of another profile, or a master, which is neither simulated nor moved",
             hint="give the EDS or DCF of a drive",
         )
-    return MakersObjects(label, rows, assumed, odd)
+    return MakersObjects(label, rows, (*assumed, *corrected), (*odd, *corrected))
 
 
 def _first_of(warnings: tuple[str, ...], place: str) -> tuple[str, ...]:
@@ -269,9 +269,10 @@ def _named(found: Mapping[tuple[int, int], ObjectRow], index: int) -> int:
 
 def _completed(
     found: dict[tuple[int, int], ObjectRow],
-) -> tuple[dict[tuple[int, int], ObjectRow], tuple[str, ...]]:
-    """Add what the standards make mandatory, and say so."""
+) -> tuple[dict[tuple[int, int], ObjectRow], list[str], list[str]]:
+    """Add what the standards make mandatory; return it with what was added, and what was read in another way."""
     assumed: list[str] = []
+    odd: list[str] = []
 
     def add(items: Iterable[tuple[int, int, str, str, str]], why: str) -> None:
         for index, sub, kind, access, value in items:
@@ -285,11 +286,18 @@ def _completed(
         if row is not None and row.type == "DOMAIN" and standard.data_type.is_integer:
             found[at] = replace(row, type=standard.type, default=_value(row.default, standard.type))
             assumed.append(f"0x{at[0]:04X}:{at[1]:02X} is {standard.type} by the standard: the file has no type for it")
-    for index, sub, kind, _, value in MANDATORY:
+    for index, sub, kind, access, value in MANDATORY:
         row = found.get((index, sub))
-        if row is not None and not row.data_type.is_integer:
-            found[index, sub] = replace(row, type=kind, default=value, low=None, high=None)
-            assumed.append(f"0x{index:04X}:{sub:02X} is {kind}, which the file's type is not")
+        if row is None:
+            continue
+        if not row.data_type.is_integer or row.data_type.size < BY_SHORT[kind].size:
+            stored = row.default if row.data_type.is_integer else value
+            odd.append(f"0x{index:04X}:{sub:02X} is {row.type} in the file, read as {kind}: so the standard has it")
+            row = replace(row, type=kind, default=_value(stored, kind), low=None, high=None)
+        if (access == "rw") > (row.access in ("rw", "wo")) or (access != "rw" and row.access == "wo"):
+            odd.append(f"0x{index:04X}:{sub:02X} is {row.access} in the file, read as {access}: so the standard has it")
+            row = replace(row, access=access)
+        found[index, sub] = row
     add(MANDATORY, "mandatory")
     announced = int(found[0x6502, 0].default_number(NODE_ID))
     for mode, items in BY_MODE.items():
@@ -306,4 +314,4 @@ def _completed(
         if index == 0x1016 and sub and row.high is not None and row.high < CONSUMER_LIMIT:
             found[index, sub] = replace(row, high=None)
             assumed.append(f"0x1016:{sub:02X} takes a node id, for which the file's limit leaves no room")
-    return dict(sorted(found.items())), tuple(assumed)
+    return dict(sorted(found.items())), assumed, odd
