@@ -332,7 +332,8 @@ def _entry(
     place: str,
     warnings: list[str],
 ) -> EdsObject:
-    word = DATA_TYPES.get(_INT.sub(lambda found: f"{_LONG[found[1]]}{found[2]}", section.get("datatype").upper()))
+    named = without_remark(section.get("datatype")).upper()
+    word = DATA_TYPES.get(_INT.sub(lambda found: f"{_LONG[found[1]]}{found[2]}", named))
     data_type = word.code if word else _number(section.get("datatype"), None, f"{place} DataType", warnings)
     if not isinstance(data_type, int):
         data_type = DOMAIN if kind == _DOMAIN_OBJECT else 0

@@ -133,8 +133,9 @@ def test_a_file_that_states_two_vendors_is_for_both(tool: Tool) -> None:
     assert code == 2 and "the file is for vendor 0x00000065" in said
 
 
-def test_quotes_remarks_and_words_for_access() -> None:
-    text = '[2000]\nParameterName="a"\nDataType="0x0006" // word\nAccessType=Read/Write\nLowLimit = "5" ; low\n'
+@pytest.mark.parametrize("kind", ['"0x0006" // word', '"UNSIGNED16"', "UINT16 ; word"])
+def test_quotes_remarks_and_words_for_access(kind: str) -> None:
+    text = f'[2000]\nParameterName="a"\nDataType={kind}\nAccessType=Read/Write\nLowLimit = "5" ; low\n'
     (entry,) = parse_eds(text.encode()).objects.values()
     assert (entry.data_type, entry.access, entry.low) == (6, "rw", 5)
 
