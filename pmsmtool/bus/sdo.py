@@ -81,6 +81,8 @@ class SdoChannel:
     ----------
     slow_objects : dict of (int, int) to float
         Time-outs (s) of objects that need longer than ``timeout_s``.
+    usual_lengths : dict of (int, int) to int
+        Bytes of objects in whose answers the node may leave the length out (CiA 301, 7.2.4.3.6, bit s = 0).
     block_supported : bool or None
         None until a block transfer was tried.
     retries, discarded : int
@@ -101,6 +103,7 @@ class SdoChannel:
         self.node = node
         self.timeout_s = timeout_s
         self.slow_objects: dict[tuple[int, int], float] = {}
+        self.usual_lengths: dict[tuple[int, int], int] = {}
         self.block_supported: bool | None = None
         self.retries = 0
         self.discarded = 0
@@ -451,6 +454,8 @@ class SdoChannel:
     def _transfer(self, index: int, sub: int, mode: Mode, size: int | None) -> Iterator[Attempt]:
         attempt = Attempt(index, sub, self.slow_objects.get((index, sub), self.timeout_s), mode, size)
         attempt.until_s = self.connection.clock.now() + OBJECT_LIMIT_S + SLOWEST_S_PER_BYTE * (size or 0)
+        if size:
+            self.usual_lengths.setdefault((index, sub), size)
         if self.connection.in_callback():
             raise PmsmtoolError(
                 "SDO transfer asked for from a bus callback, where it would wait for itself",

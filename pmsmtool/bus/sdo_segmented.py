@@ -22,7 +22,8 @@ def upload(channel: SdoChannel, attempt: Attempt, first: bytes) -> bytes:
     """Return the object whose normal upload the node began with the frame ``first``."""
     if first[0] & 0x02:
         attempt.mode = Mode.EXPEDITED
-        length = 4 - (first[0] >> 2 & 3) if first[0] & 0x01 else min(4, attempt.size or 4)
+        usual = attempt.size or channel.usual_lengths.get((attempt.index, attempt.sub), 4)
+        length = 4 - (first[0] >> 2 & 3) if first[0] & 0x01 else min(4, usual)
         return channel.check_size(attempt, first[4 : 4 + length], None)
     attempt.mode = Mode.SEGMENTED
     announced = int.from_bytes(first[4:8], "little") if first[0] & 0x01 else None

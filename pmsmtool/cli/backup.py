@@ -82,4 +82,4 @@ def _listed(eds: str) -> list[Listed]:
     from pmsmtool.sim.foreign.file_rows import read_makers_objects
 
     rows = read_makers_objects(eds).rows.values()
-    return [Listed(row.index, row.sub, row.name, row.copied) for row in rows if row.access == "rw"]
+    return [Listed(row.index, row.sub, row.name, row.copied, row.data_type.size) for row in rows if row.access == "rw"]

@@ -327,7 +327,8 @@ def _abort_option(drive: CanopenDrive) -> AbortConnection | None:
     except SdoAbort as abort:
         if abort.code in ABSENT and drive.commands_bounded_current:
             return None
-        raise _refused("the drive has no object for its reaction to a lost connection (0x6007)", drive) from abort
+        what = f"the drive's reaction to a lost connection (0x6007) cannot be made to stop: {abort.what}"
+        raise _refused(what, drive) from abort
     if option not in _STOPPING:
         raise _refused(f"abort connection option code {option} does not stop the machine", drive)
     return AbortConnection(option)

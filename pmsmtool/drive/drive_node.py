@@ -115,6 +115,7 @@ class DriveNode:
         A whole number may have another width than the standard's: makers keep 0x6075 in 16 bits and 0x6071 in 32. From
         now on it is read, written and mapped in its own.
         """
+        self.sdo.usual_lengths.setdefault((item.index, item.sub), item.size)
         try:
             data = self.sdo.read(item.index, item.sub)
         except SdoAbort as abort:
@@ -168,6 +169,7 @@ class DriveNode:
 
     def write_bytes(self, index: int, sub: int, data: bytes, *, retry: Retry = Retry.READ_BACK) -> None:
         """Write the bytes of an object."""
+        self.sdo.usual_lengths[index, sub] = len(data)
         if self.before_write is not None:
             self.before_write(index, sub, data)
         self.sdo.download(index, sub, data, retry=retry)
@@ -221,7 +223,7 @@ class DriveNode:
         wrong = [
             f"0x{index:04X}:{sub:02X}"
             for index, sub, size in drive_map.identity.marks
-            if len(_held(self.sdo, index, sub)) != size
+            if len(_held(self.sdo, index, sub, size)) != size
         ]
         if not wrong and drive_map.identity.marks:
             return ""
@@ -477,7 +479,7 @@ def vendor_product_serial(sdo: SdoChannel, drive_map: DriveMap | None = None) ->
     known = None if serial else _map_of(drive_map, vendor, product)
     if known is not None and known.identity.serial is not None:
         index, sub, size = known.identity.serial
-        data = _held(sdo, index, sub)
+        data = _held(sdo, index, sub, size)
         serial = int.from_bytes(data, "little") if len(data) == size else 0
     return vendor, product, serial
 
@@ -504,8 +506,9 @@ def _map_of(drive_map: DriveMap | None, vendor: int, product: int) -> DriveMap |
     return family_of(vendor, product)
 
 
-def _held(sdo: SdoChannel, index: int, sub: int) -> bytes:
-    """Return an object's bytes, none where the node does not show it."""
+def _held(sdo: SdoChannel, index: int, sub: int, size: int) -> bytes:
+    """Return an object's bytes, ``size`` of them where the node does not say how many; none where it is not shown."""
+    sdo.usual_lengths.setdefault((index, sub), size)
     try:
         return sdo.upload(index, sub, longest=LONGEST_NAME).data
     except SdoAbort:

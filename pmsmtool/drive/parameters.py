@@ -96,6 +96,7 @@ class DriveParameters:
         gain = self.held_value(cell.gain) if cell is not None and cell.gain else None
         if cell is None or (cell.gain and gain is None):
             return None
+        self.node.sdo.usual_lengths.setdefault((cell.index, cell.sub), cell.size)
         try:
             data = self.node.sdo.read(cell.index, cell.sub)
         except SdoAbort as abort:

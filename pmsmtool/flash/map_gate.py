@@ -131,6 +131,7 @@ def map_on(node: DriveNode) -> DriveMap:
 def _not_there(node: DriveNode, cell: Cell) -> str:
     """Return why a row is not the drive's; empty where its object is there, in the size that the map states."""
     where = f"0x{cell.index:04X}:{cell.sub:02X}"
+    node.sdo.usual_lengths.setdefault((cell.index, cell.sub), cell.size)
     try:
         size = len(node.sdo.upload(cell.index, cell.sub).data)
     except SdoAbort as abort:

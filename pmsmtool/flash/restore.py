@@ -76,6 +76,7 @@ def tell_lacking(node: DriveNode, plan: Plan) -> None:
 
 def plan_restore(node: DriveNode, snapshot: Snapshot) -> Plan:
     """Read what a drive holds and return the plan that brings a snapshot's old contents back."""
+    node.sdo.usual_lengths |= {(entry.index, entry.sub): len(entry.old) for entry in snapshot.entries if entry.old}
     return restore_plan(node.map, snapshot, _settled(node).read(names_of(snapshot)))
 
 

@@ -62,12 +62,16 @@ _BY_NAME: tuple[tuple[re.Pattern[str], str], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Listed:
-    """An object that the data sheet says can be read and written; ``copied``: also by a backup and a download."""
+    """An object that the data sheet says can be read and written; ``copied``: also by a backup and a download.
+
+    ``size``: bytes of its type, 0 where they are not fixed.
+    """
 
     index: int
     sub: int
     name: str
     copied: bool = True
+    size: int = 0
 
     @property
     def label(self) -> str:
@@ -121,6 +125,8 @@ def take_whole_backup(
     kept, left_out = kept_objects(listed)
     entries = []
     for count, item in enumerate(kept, 1):
+        if item.size:
+            node.sdo.usual_lengths[item.index, item.sub] = item.size
         try:
             entries.append(Entry(item.label, item.index, item.sub, node.sdo.upload(item.index, item.sub).data))
         except SdoAbort as abort:
