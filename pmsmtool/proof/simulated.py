@@ -31,7 +31,15 @@ from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.proof.conditions import Conditions
 from pmsmtool.proof.defects import DEFECTS, QUANTITIES, Defect, is_possible
-from pmsmtool.proof.drawn_machine import EMF_HARMONICS, T_MAGNET_SPREAD_K, T_SPREAD_K, U_DC_SPREAD, about, draw_machine
+from pmsmtool.proof.drawn_machine import (
+    EMF_HARMONICS,
+    T_MAGNET_SPREAD_K,
+    T_SPREAD_K,
+    U_DC_SPREAD,
+    about,
+    draw_machine,
+    with_fine_cogging,
+)
 from pmsmtool.proof.plan import Experiment, ProofPlan
 from pmsmtool.proof.simulated_move import hold, record_move, weaken
 from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
@@ -90,6 +98,8 @@ class Start:
         Angle of the shaft (rad).
     weakened : float
         d current that field weakening without a table starts from, of the one of least current at rated torque.
+    cogging : float
+        Of a move: share of the largest usual cogging.
     """
 
     base_speed: float
@@ -98,6 +108,7 @@ class Start:
     held: float
     theta_M_rad: float
     weakened: float
+    cogging: float
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Start:
@@ -106,6 +117,7 @@ class Start:
             float(rng.uniform(*BASE_SPEED)), int(rng.integers(PHASES)),
             int(rng.integers(COAST_PERIODS[0], COAST_PERIODS[1] + 1)),
             float(rng.uniform(-1.0, 1.0)), float(rng.uniform(-math.pi, math.pi)), float(rng.uniform(0.0, 1.0)),
+            float(rng.uniform(0.0, 1.0)),
         )  # fmt: skip
 
 
@@ -249,6 +261,8 @@ class SimulatedDrives:
             setup.machine.psi_6 = setup.machine.psi_7 = 0.0  # repeats show by themselves what of them is left
         in_speed_mode = experiment.excitation.point is Injection.SPEED
         start = self._starts[experiment.name, row]
+        if experiment.move is not None:
+            with_fine_cogging(setup, self._design.machine, start.cogging)
         share, setup.theta_M = 0.0 if in_speed_mode else start.base_speed, start.theta_M_rad
         setup.omega_M = (1.0 + share) * experiment.base_rad_s + lead_rad_s
         params = Params()

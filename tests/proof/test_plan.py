@@ -26,11 +26,20 @@ from pmsmtool.machine.temperature import WARMING
 from pmsmtool.machine.torque import iron_drag, torque_per_ampere
 from pmsmtool.machine.two_masses import INERTIA, PLAY_FACTOR, REFUSED, SWING, TORQUE_NOISE, UNSEEN
 from pmsmtool.proof.conditions import Conditions
-from pmsmtool.proof.drawn_machine import EMF_HARMONICS, FRICTION_FACTOR, LAG_SHARES, LATE_SHARE
+from pmsmtool.proof.drawn_machine import (
+    EMF_HARMONICS,
+    FINE_COGGING,
+    FINE_ORDER,
+    FRICTION_FACTOR,
+    LAG_SHARES,
+    LATE_SHARE,
+    with_fine_cogging,
+)
 from pmsmtool.proof.judgement import LEAST_STEADY_ROWS
 from pmsmtool.proof.plan import LONGEST_S, SIGNALS, STEPS, WEAKENING_SLOPE, _apart, plan_proof
 from pmsmtool.proof.simulated import BASE_SPEED, SimulatedDrives, as_tested
 from pmsmtool.proof.stage import ProofRequest, envelope_of
+from pmsmtool.sim.kernel import Setup
 from pmsmtool.units import RAD_S_PER_RPM
 
 
@@ -434,6 +443,24 @@ def test_the_prediction_has_harmonics_and_the_noise_of_the_encoder() -> None:
     seen = replace(made, machine=replace(made.machine, estimates={**made.machine.estimates, "psi_5_wb": psi_5}))
     for one in SimulatedDrives(seen, limits, plan_proof(seen, limits), 8, 0).setups:
         assert 0.5e-5 <= abs(one.machine.psi_6) <= 1.5e-5
+
+
+def test_a_move_is_predicted_with_cogging_that_no_coasting_shows() -> None:
+    """Real drive 217469, 4.8 % of the rated torque in order 180: healthy, and at 1.9 of the band of a move."""
+    made = light()
+    known = made.machine
+    rated_nm = abs(known.torque_nm(0.0, known.I_nom_apk or 0.0))
+
+    def drawn(machine: MachineFile, before_nm: float = 0.0) -> tuple[float, float]:
+        setup = Setup()
+        setup.machine.cogging = before_nm
+        with_fine_cogging(setup, machine, 0.5)
+        return setup.machine.cogging, setup.machine.cogging_periods
+
+    assert drawn(made) == (pytest.approx(0.5 * FINE_COGGING * rated_nm), FINE_ORDER * known.pole_pairs)
+    assert drawn(made, 1e-3) == (1e-3, 0.0)
+    none = Estimate(0.0, 1e-4, 0.0, "N m")
+    assert drawn(replace(made, estimates={**made.estimates, "cogging_nm": none})) == (0.0, 0.0)
 
 
 def test_the_prediction_has_the_two_masses_that_the_resonance_tells() -> None:
