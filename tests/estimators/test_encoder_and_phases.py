@@ -20,7 +20,15 @@ from pmsmtool.estimators.encoder import (
 from pmsmtool.estimators.estimate import SensorTolerance, Verdict
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.resistance import ResistanceResult
-from pmsmtool.identification.phase_check import BALANCE_LIMIT, SMALL_LIMIT, check_pairs, check_phases, over_phases
+from pmsmtool.identification.phase_check import (
+    BALANCE_LIMIT,
+    SMALL_LIMIT,
+    USUAL_BEYOND,
+    PairCheck,
+    check_pairs,
+    check_phases,
+    over_phases,
+)
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.refusals import REFUSALS, refuse
 from pmsmtool.trace import Trace
@@ -230,8 +238,23 @@ def test_unequal_phases_give_the_mean_of_them() -> None:
     assert mean.R_measured.value == pytest.approx(2.0) and mean.R_s.value == pytest.approx(2.0)
     assert mean.R_s.systematic >= 0.03  # what a pair of phases is off the mean
     assert "a 2.06, b 1.98, c 1.96" in mean.R_s.fallback
-    alike = check_pairs(pairs((2.001, 2.0, 2.0)), NOISE, STEP)
-    assert over_phases(levels, alike, SensorTolerance()) is levels
+    alike = over_phases(levels, check_pairs(pairs((2.001, 2.0, 2.0)), NOISE, STEP), SensorTolerance())
+    assert alike.R_measured == replace(R, systematic=pytest.approx(0.01, rel=1e-2)) and not alike.R_s.fallback
+
+
+def test_a_difference_of_phases_that_is_not_sure_is_in_the_interval_of_r() -> None:
+    """Real drive 217486: 0.8 % of R at 3.5 standard deviations, and R was 1.0 % off."""
+    R = Estimate(1.98, 1e-3, 0.01, "ohm", T_c=20.0)
+    levels = ResistanceResult(R, R, STEP, 5.0, 0.0, Verdict.PASS)
+    unsure = PairCheck((1.98, 2.01, 2.01), SensorMismatch((0.0, 0.0, 0.0), 1e-3), std_ohm=0.006)
+    found = over_phases(levels, unsure, SensorTolerance())
+    assert found.R_measured.value == R.value
+    assert found.R_measured.systematic == pytest.approx(math.hypot(0.01, 0.02))
+    assert found.R_s.systematic >= found.R_measured.systematic
+    far = over_phases(levels, replace(unsure, resistance_ohm=(1.5, 2.25, 2.25), std_ohm=0.5), SensorTolerance())
+    assert far.R_measured.systematic == pytest.approx(math.hypot(0.01, USUAL_BEYOND * 1.98))
+    moved = over_phases(levels, replace(unsure, judged=False), SensorTolerance())
+    assert moved.R_measured.systematic == pytest.approx(0.01)
 
 
 def test_what_the_noise_of_a_mean_voltage_makes_is_no_unequal_phase() -> None:
