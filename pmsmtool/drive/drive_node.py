@@ -396,7 +396,14 @@ class DriveNode:
         """
         operational = self.supervision.nmt_state is NmtState.OPERATIONAL
         with self.supervision.expected_reset():
-            reset_node(self.connection, self.node)
+            try:
+                reset_node(self.connection, self.node)
+            except DriveTimeout as error:
+                with contextlib.suppress(DriveTimeout):
+                    self.has(objects.DEVICE_TYPE.index, objects.DEVICE_TYPE.sub)
+                    error.likely = "it answers: it does not obey the reset, or sends no boot-up message"
+                    error.hint = "switch the drive off and on, then see with `pmsmtool verify` what it has stored"
+                raise
             self._wait_until_ready()
         if operational:
             send_nmt(self.connection, NmtCommand.START, self.node)

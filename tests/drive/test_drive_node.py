@@ -278,6 +278,18 @@ def test_a_reset_node_is_waited_for_and_started_again(silent_s: float, back: boo
         node.supervision.check()  # its boot-up was wanted
 
 
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_node_that_ignores_its_reset_is_not_called_silent(silent: bool) -> None:
+    """Its SDO server was blamed, which nobody had asked."""
+    with node_of({}) as (table, node):
+        table.nmt = lambda data: []  # type: ignore[method-assign]
+        if silent:
+            table.answer = lambda data: iter(())  # type: ignore[method-assign]
+        with pytest.raises(DriveTimeout, match="no boot-up") as caught:
+            node.reset()
+        assert ("does not obey the reset" in caught.value.likely) is not silent
+
+
 # ---- stops ----------------------------------------------------------------------------------------
 
 
