@@ -46,6 +46,8 @@ R_MEASURED = "R_s_ohm_measured"
 
 TAIL_POWERS = (1, 2, 3, 4, 6)
 TAIL_TERMS = 2
+SHARED = 5
+"""Columns before the tails: R, V, v_0, drift, what of V falls with the link."""
 LEADING = 1
 """Power that every tail has: a small current commutates slowly, and its error falls off as 1/|i|. A tail that could
 begin with 1/|i|^2 fits as well where levels scatter by 1e-4, and takes the rest for resistance: a machine of hardness
@@ -328,7 +330,13 @@ def _warmth(t: Array, T: Array, fall: Array, i: Array, v: Array, peak: float, si
     from scipy.optimize import minimize_scalar
 
     def misfit(warmth: Array) -> float:
-        return min(_fit_tail(warmth, fall, i, v, peak, sigma_v, powers).chi2 for powers in tail_models())
+        columns, target, weight = _tail_rows(warmth, fall, i, v, peak, sigma_v)
+        rows, shared = columns * weight[:, None], [*range(SHARED + 1), -1]  # each model has one column more, at most
+        q = np.linalg.qr(rows[:, shared])[0]
+        further = np.column_stack([target * weight, rows[:, SHARED + 1 : -1]])
+        left = further - q @ (q.T @ further)
+        v_left, tails = left[:, 0], left[:, 1:]
+        return float(v_left @ v_left - np.max((v_left @ tails) ** 2 / np.sum(tails**2, axis=0)))
 
     found = minimize_scalar(
         lambda log_tau: misfit(_heated(t, i, peak, math.exp(log_tau))),
@@ -343,12 +351,12 @@ def _warmth(t: Array, T: Array, fall: Array, i: Array, v: Array, peak: float, si
 
 def _heated(t: Array, i: Array, peak: float, tau_s: float) -> Array:
     """Return the warmth of a winding of one time constant (1), cold before the first level: late in every level."""
-    out, warm, before = np.empty_like(i), 0.0, float(t[0] - np.median(np.diff(t)))
-    for k, (now, current) in enumerate(zip(t, i, strict=True)):
-        rest, late = (1.0 - math.exp(-part * (now - before) / tau_s) for part in (1.0, LATE))
-        out[k] = warm + late * ((current / peak) ** 2 - warm)
-        warm, before = warm + rest * ((current / peak) ** 2 - warm), now
-    return out
+    passed = np.diff(t, prepend=t[0] - np.median(np.diff(t))) / tau_s
+    out, warm = [], 0.0
+    for rest, late, heat in zip(-np.expm1(-passed), -np.expm1(-LATE * passed), (i / peak) ** 2, strict=True):
+        out.append(warm + late * (heat - warm))
+        warm += rest * (heat - warm)
+    return np.array(out)
 
 
 def _level_sigma(t: Array, fall: Array, i: Array, v: Array, peak: float, R_0: float, noise_v: float) -> float:
@@ -455,17 +463,15 @@ def _per_k(R_ohm: float, copper: Copper, T_c: float) -> float:
     return copper.alpha_per_k * min(copper.R_winding_ohm or math.inf, all_copper)
 
 
-def _fit_tail(
-    t: Array, fall: Array, i: Array, v: Array, peak: float, sigma_v: float, powers: tuple[int, ...]
-) -> _TailFit:
-    """Fit the levels: R, V, v_0, drift, what of V falls with the link, and the tail."""
+def _tail_rows(t: Array, fall: Array, i: Array, v: Array, peak: float, sigma_v: float) -> tuple[Array, Array, Array]:
+    """Return columns, target and weights of the levels: R, V, v_0, drift, what of V falls with the link, all tails."""
     used = _fitted(i, peak)
     span = float(np.ptp(t))
     i, v, t, fall = i[used], v[used], t[used], fall[used]
     sign, u = np.sign(i), np.abs(i) / peak
     centre = float(np.sum(t * i**2) / np.sum(i**2))
     drift = i * (t - centre) / span  # zero at the mean heating: R belongs to T_w
-    odd_tail = (sign / u**p for p in powers)
+    odd_tail = (sign / u**p for p in TAIL_POWERS)
     columns = np.stack([i, sign, np.ones_like(i), drift, sign * fall, *odd_tail, u**-EVEN_POWER], axis=1)
     # one row more: how much of V falls with the link is known about as well
     share = np.zeros((1, columns.shape[1]))
@@ -473,7 +479,16 @@ def _fit_tail(
     off = u - np.mean(u)
     V_rough = abs(float(np.mean(np.abs(v)) - np.mean(u) * (off @ np.abs(v)) / (off @ off)))
     weight = 1.0 / np.append(np.full_like(v, sigma_v), LINK_SHARE_STD * max(V_rough, sigma_v))
-    x, covariance, residual, condition = linear_solve(np.vstack([columns, share]), np.append(v, 0.0), weight)
+    return np.vstack([columns, share]), np.append(v, 0.0), weight
+
+
+def _fit_tail(
+    t: Array, fall: Array, i: Array, v: Array, peak: float, sigma_v: float, powers: tuple[int, ...]
+) -> _TailFit:
+    """Fit the levels by a tail of some powers."""
+    columns, target, weight = _tail_rows(t, fall, i, v, peak, sigma_v)
+    kept = [*range(SHARED), *(SHARED + TAIL_POWERS.index(p) for p in powers), -1]
+    x, covariance, residual, condition = linear_solve(columns[:, kept], target, weight)
     return _TailFit(x, covariance, float(residual @ residual), len(residual) - len(x), condition)
 
 
