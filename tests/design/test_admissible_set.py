@@ -138,7 +138,7 @@ def test_no_state_inside_the_rows_violates_a_later_one() -> None:
         return float(np.hypot(*(rows[kept + 1 :] @ (centre + low * (x - centre)) + offset).T).max())
 
     worst_inside = worst_short = 0.0
-    for _ in range(1500):
+    for _ in range(500):
         # a state by the voltages it stands for: steady state, now, and one sample ahead, all near the limit
         angle = rng.uniform(0.0, 2.0 * math.pi) + rng.normal(0.0, 0.2, 3) + np.array([0.0, math.pi, math.pi])
         size = np.array([1.0 - eps, 1.0, rng.uniform(0.2, 1.0)])

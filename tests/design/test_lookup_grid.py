@@ -9,6 +9,7 @@ import math
 import re
 import struct
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,7 @@ PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 M = OperatingMachine(4, 0.05, 1e-3, 2.5e-3, 0.1)
 
 
+@cache
 def made(profile: str, **asked: Any) -> LookupDesign:
     source = load_machine_file(PROFILES / f"{profile}.toml")
     rated = ratings(source, 0.92 * source.inverter.V_max_v)
@@ -472,7 +474,7 @@ def run(*arguments: str) -> tuple[int, str]:
 def test_command(tmp_path: Path) -> None:
     target = tmp_path / "lut.npz"
     source = str(PROFILES / "mtpv-test.toml")
-    points = ["--torque-points", "12", "--speed-points", "9"]
+    points = ["--torque-points", "7", "--speed-points", "5"]
     code, text = run(source, "-o", str(target), *points, "--plot", str(tmp_path / "lut.svg"))
     assert code == 0 and "mtpv" in text
     assert target.exists() and (tmp_path / "lut.csv").exists()

@@ -204,7 +204,7 @@ def spline(i_d: np.ndarray, i_q: np.ndarray, psi_d: np.ndarray, psi_q: np.ndarra
     return flux
 
 
-def measured(hot: bool) -> Bench:
+def measured() -> Bench:
     path = MAPS / "baldor_400rpm_map.npz"
     if not path.exists():
         pytest.skip(f"{path} is not there")
@@ -213,12 +213,9 @@ def measured(hot: bool) -> Bench:
     psi_d, psi_q = np.ascontiguousarray(data["psi_s_dq"].real), np.ascontiguousarray(data["psi_s_dq"].imag)
     flux_map = FluxMap(i_d, i_q, psi_d, psi_q)
     parameters = MachineParameters(2, 0.63, 0.03, 0.09, 0.45, alpha_psi_per_k=-0.0012)
-    machine = at_temperature(
-        parameters, flux_map, T_winding_c=140.0 if hot else None, T_magnet_c=120.0 if hot else None
-    )
-    shift = 0.45 * -0.0012 * 100.0 if hot else 0.0
-    base = spline(i_d, i_q, psi_d + shift, psi_q)
-    assert machine.R == pytest.approx(0.63 * (1.0 + 0.00393 * 120.0) if hot else 0.63)
+    machine = at_temperature(parameters, flux_map, T_winding_c=140.0, T_magnet_c=120.0)
+    base = spline(i_d, i_q, psi_d - 0.45 * 0.0012 * 100.0, psi_q)
+    assert machine.R == pytest.approx(0.63 * (1.0 + 0.00393 * 120.0))
     return Bench(machine, base, 20.0, 540.0 / math.sqrt(3.0), (0.0, 900.0, 2100.0, 6000.0), edge=(-20.0, 20.0, 26.0))
 
 
@@ -245,8 +242,7 @@ BENCHES: dict[str, Callable[[], Bench]] = {
     "current falls again": falling_again,
     "backwards": lambda: linear(4, 0.137, 2.3e-3, 2.1e-3, 0.41, 56.0, 121.24, -620.0, -900.0, -1100.0),
     "hot": warm,
-    "measured, cold": lambda: measured(False),
-    "measured, hot": lambda: measured(True),
+    "measured, hot": measured,
 }
 
 

@@ -57,10 +57,10 @@ def test_a_signal_it_has_not_is_named(opened: Opener) -> None:
 
 @pytest.mark.chain
 def test_lost_frames_never_give_a_wrong_record(opened: Opener) -> None:
-    """One frame of the drive lost, at 24 places from set-up to data: the right record, or an error that says so."""
+    """One frame of the drive lost, at 12 places from set-up to data: the right record, or an error that says so."""
     right = wrong = 0
     rows = min(300, opened().kind.capacity_rows)
-    for after in range(20, 260, 10):
+    for after in range(20, 260, 20):
         rig = opened(LOST_FRAME.format(after=after))
         try:
             trace = rig.record(rows)
@@ -70,9 +70,9 @@ def test_lost_frames_never_give_a_wrong_record(opened: Opener) -> None:
         check(trace, rows, 1)
         right += 1
     assert right > 0
-    assert right + wrong == 24
+    assert right + wrong == 12
     if isinstance(rig.recorder, MonitorRecorder):
-        assert wrong > 10  # a block that was taken cannot be asked for again
+        assert wrong > 5  # a block that was taken cannot be asked for again
 
 
 @pytest.mark.parametrize("off", [-1, 1])

@@ -123,7 +123,6 @@ def test_what_caps_promises_is_what_is_found_without_a_dead_time() -> None:
     known = load_machine_file(machine_path("interior-2k2")).inverter
     assert known is not None
     for given, inverter in (
-        ("", None),
         ("", replace(known, dead_time_s=0.0)),  # as `machine new` without --dead-time leaves it
         ("a machine file that names the dead time", known),
     ):

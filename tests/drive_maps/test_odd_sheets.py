@@ -51,7 +51,7 @@ def sheets(draw: st.DrawFn) -> bytes:
 
 
 @pytest.mark.chain
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(sheets())
 def test_any_file_is_read_or_refused_by_name(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "x.eds"

@@ -327,14 +327,13 @@ def test_drag_over_the_square_of_the_speed_is_told_from_friction() -> None:
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize("stribeck", [0.3, 0.6])
-def test_friction_that_falls_with_the_speed_is_no_drag(stribeck: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_friction_that_falls_with_the_speed_is_no_drag(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before, a drag of 15 standard deviations: at ten times this speed 30 times the friction."""
     monkeypatch.setattr(f"{__name__}.B", 0.0)
     monkeypatch.setattr(f"{__name__}.TAU_C", 3.0 * TAU_C)
     traces = run_of(np.random.default_rng(5))
     fastest = max(float(np.max(np.abs(np.diff(t["theta_M_rad"])))) / t.period_s for t in traces)
-    found = estimate(with_drag(traces, stribeck=stribeck, omega_s=0.1 * fastest))
+    found = estimate(with_drag(traces, stribeck=0.6, omega_s=0.1 * fastest))
     assert found.drag is None and found.J.value == pytest.approx(J, rel=1e-3), "within 2e-4 seen"
     assert abs(found.B.value) < 2.0 * found.B.std, "between the models with drag and without lies none"
 
@@ -439,7 +438,7 @@ def test_a_short_way_over_fine_cogging_and_with_wrong_sensors_keeps_the_inertia(
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize("effect", [{"tilt": 3e-3}, {"friction": 0.15}, {"encoder": 6e-3}, {}])
+@pytest.mark.parametrize("effect", [{"tilt": 3e-3}, {"friction": 0.15}, {"encoder": 6e-3}])
 def test_what_repeats_with_the_angle_or_grows_with_the_speed_is_no_friction(effect: dict[str, float]) -> None:
     """Before: tau_c 11 deviations (8 %) off with friction over the angle, B 25 (20 %) by the encoder, 3 by the tilt."""
     found = estimate(braked(np.random.default_rng(12), **effect))

@@ -77,7 +77,7 @@ def test_binary32_makes_no_torque_noise_of_the_coasting() -> None:
     """With a step that is a rounding too small, the residual asks for noise of the coasting: B by ten times worse."""
     rng = np.random.default_rng(5)
     seen = 0
-    while seen < 3:
+    while seen < 2:
         traces, truth, per_a, sigma = realisation(rng)
         step = encoder_step([trace["theta_M_rad"] for trace in traces])
         if max(float(np.max(np.abs(trace["theta_M_rad"]))) for trace in traces) < 300.0 or step > 3e-5:
@@ -105,7 +105,7 @@ def test_few_steps_of_a_coarse_encoder_leave_a_wide_interval_that_holds_the_trut
     per_a, current, unit, step = 0.9, 4.0, 0.2, 2.0 * math.pi / 2**11
     speed = 2.0 * steps * step / unit
     J, B, tau_c = per_a * current * unit / speed, 0.01 * per_a * current / speed, 0.02 * per_a * current
-    for _ in range(8):
+    for _ in range(4):
         traces, omega = [], 0.0
         for i, seconds in ((current, unit), (0.0, 6.0 * unit), (-current, 2.0 * unit), (0.0, 6.0 * unit)):
             rows = 1000

@@ -67,18 +67,14 @@ ANGLE: tuple[Row, ...] = (
 
 
 @pytest.mark.chain
-def test_a_mode_that_is_not_taken_back_is_no_failure(tool: Tool) -> None:
-    """Some drives wake up in a mode (-1) that they refuse when it is written."""
-    rows = tuple((*row[:4], "-1") if row[0] == 0x6060 else row for row in ANGLE)
-    code, said = commissioned(tool, rows, {(0x6060, 0): (-128, 10)})
-    assert code == 10 and "[1/7] identify  PASS" in said, said
-
-
-@pytest.mark.chain
 @pytest.mark.parametrize("taken", [True, False])
 def test_mode_11_tells_pole_pairs_and_its_refusal_leaves_the_pulses(tool: Tool, taken: bool) -> None:
-    """Some drives announce bit 10 of 0x6502 and refuse the mode; torque pulses need it not, a design neither."""
-    code, said = commissioned(tool, ANGLE, None if taken else {(0x6060, 0): (0, 10)})
+    """Some drives announce bit 10 of 0x6502 and refuse the mode; torque pulses need it not, a design neither.
+
+    The one that refuses it wakes up in a mode (-1) that it does not take back when it is written.
+    """
+    rows = tuple((*row[:4], "-1") if row[0] == 0x6060 and not taken else row for row in ANGLE)
+    code, said = commissioned(tool, rows, None if taken else {(0x6060, 0): (-128, 10)})
     pole_pairs = next(line.split()[-2:] for line in said.splitlines() if line.split()[:1] == ["pole_pairs"])
     assert code == 10 and "[1/7] identify  PASS" in said and "J_per_psi" in said, said
     assert said.count("at most 6.08 Apk") == 1, "asked once"

@@ -410,7 +410,7 @@ _FUZZED_IDS = [0x601, 0x000, 0x7E5, 0x080, 0x701, 0x201, 0x77F]
 
 @pytest.mark.chain
 @given(st.lists(st.tuples(st.sampled_from(_FUZZED_IDS), st.binary(max_size=8)), max_size=40))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 def test_random_frames_never_break_the_node(frames: list[tuple[int, bytes]]) -> None:
     """After any frames at all, a reset node answers again."""
     bench = open_bench()

@@ -71,7 +71,8 @@ def install(folder: Path) -> Installation:
     env = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "CC")}
     env["PATH"] = str(folder / "environment" / "bin")
     assert not any(shutil.which(name, path=env["PATH"]) for name in CANDIDATES)
-    command = [sys.executable, "-m", "pip", "--python", str(python), "install", "-v", "--no-deps", str(sources)]
+    command = [sys.executable, "-m", "pip", "--python", str(python), "install", "-v", "--no-deps", "--no-compile",
+               str(sources)]  # fmt: skip
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True)
     log = done.stdout + done.stderr
     if done.returncode != 0 and any(text in log for text in NO_INDEX):

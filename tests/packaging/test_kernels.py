@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -93,19 +92,13 @@ def test_a_missing_function_is_found_when_linking(working_compiler: compiler.Com
 @pytest.mark.chain
 def test_same_source_same_bytes(working_compiler: compiler.Compiler, tmp_path: Path) -> None:
     """Also from another folder: no path of the building machine gets into a library."""
-    smallest = KERNELS[-1]
-    for source in (
-        *smallest.source_files(PACKAGE),
-        *(p for pattern in compiler.HEADERS for p in PACKAGE.glob(pattern)),
-    ):
-        copy = tmp_path / "one" / "pmsmtool" / (source.relative_to(PACKAGE) if source.is_absolute() else source)
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(PACKAGE / source, copy)
-    shutil.copytree(tmp_path / "one", tmp_path / "another-place")
-    libraries = []
+    kernel, libraries = Kernel("x", ("x.c", "part/y.c")), []
     for name in ("one", "another-place"):
-        library = tmp_path / name / native.library_name(smallest.name)
-        compiler.compile_library(working_compiler, smallest, tmp_path / name / "pmsmtool", library)
+        (tmp_path / name / "part").mkdir(parents=True)
+        (tmp_path / name / "x.c").write_text("char const *pmsm_x(void) { return __FILE__; }\n")
+        (tmp_path / name / "part" / "y.c").write_text("char const *pmsm_y(void) { return __FILE__; }\n")
+        library = tmp_path / name / native.library_name(kernel.name)
+        compiler.compile_library(working_compiler, kernel, tmp_path / name, library)
         libraries.append(library.read_bytes())
     assert libraries[0] == libraries[1]
 

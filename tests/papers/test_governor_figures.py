@@ -169,6 +169,6 @@ def test_delay_without_predictor_overshoots() -> None:
 
 
 def test_same_seed_same_numbers_and_another_seed_others() -> None:
-    first, again = (random_steps(7, 12) for _ in range(2))
+    first, again = (random_steps(7, 6) for _ in range(2))
     assert [table.rows[:2] for table in first.tables] == [table.rows[:2] for table in again.tables]
-    assert first.tables[0].rows != random_steps(8, 12).tables[0].rows
+    assert first.tables[0].rows != random_steps(8, 6).tables[0].rows
