@@ -471,7 +471,7 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 @pytest.mark.chain
-def test_command(tmp_path: Path) -> None:
+def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "lut.npz"
     source = str(PROFILES / "mtpv-test.toml")
     points = ["--torque-points", "7", "--speed-points", "5"]
@@ -481,7 +481,9 @@ def test_command(tmp_path: Path) -> None:
     first = (tmp_path / "lut.svg").read_bytes()
     assert run(source, "-o", str(target), *points, "--plot", str(tmp_path / "lut.svg"))[0] == 0
     assert (tmp_path / "lut.svg").read_bytes() == first
-    assert run(source, "-o", str(target), "--torque-bound", "1e-4")[0] == 1
+    with monkeypatch.context() as patched:  # what fills the whole memory is tried above
+        patched.setattr("pmsmtool.design.lookup.grid._TURNS_MAX", 2)
+        assert run(source, "-o", str(target), "--torque-bound", "1e-4")[0] == 1
     assert run(source, "-o", str(target), "--torque-points", "12")[0] == 2
     assert run(source, "-o", str(target), *points, "--plot", str(tmp_path / "lut.xyz"))[0] == 2
     flux = run(source, "-o", str(target), *points, "--axis", "flux", "--plot", str(tmp_path / "flux.svg"))
