@@ -31,12 +31,14 @@ from pmsmtool.drive.process_data import LiveValues, live_values
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S
 from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
-from pmsmtool.errors import LimitExceeded, NotAvailable, SdoAbort
+from pmsmtool.errors import DriveTimeout, LimitExceeded, NotAvailable, SdoAbort
 from pmsmtool.trace import Trace
 
 ASKED = ("asked", "flows")
 OSCILLATION_SAMPLES = 20
 """Periods of sampling over which an oscillation is judged."""
+SPEED_S, LOOK_S, SILENT_S = 1e-2, 5e-3, 0.05
+"""Time over which a speed is watched, how often outside of records, and for how long no sample may come."""
 LARGEST_COUNT = 2.0 * math.pi
 """Largest speed that one count of any drive's velocity is worth (rad/s): a turn per second."""
 
@@ -108,6 +110,8 @@ class SpeedLoopDrive(TorqueDrive):
         Whether the current that is shown was taken as rms without a source: a share of 0x6075 is, too.
     sends : bool
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
+    fastest_rad_s : float
+        Speed by the samples at which :meth:`wait` raises ``LimitExceeded``; infinity: not watched.
     asked : tuple of DriveObject
         Where it shows the current that its speed loop asks for, and what flows, in one unit; empty: it does not.
     """
@@ -135,6 +139,9 @@ class SpeedLoopDrive(TorqueDrive):
         self.oscillation = Oscillation()
         self.sends = True
         self.asked = asked_current(self.node, self._current)
+        self.fastest_rad_s = math.inf
+        self._seen: deque[tuple[float, float]] = deque()
+        self._seen_s = math.inf
         self._sending: AbstractContextManager[LiveValues] | None = None
         self._samples: list[Row] = []
         self._due: list[tuple[float, float]] = []
@@ -181,6 +188,7 @@ class SpeedLoopDrive(TorqueDrive):
         self._sending = sending
 
         def note(stamp_s: float) -> None:
+            self._see(stamp_s, live.values["position"])
             if self._recording:
                 # an adapter's time stamps begin where they like; the shortest way here ties them to the clock
                 self._behind_s = min(self._behind_s, self.node.connection.clock.now() - stamp_s)
@@ -191,7 +199,8 @@ class SpeedLoopDrive(TorqueDrive):
         live.on_set = note
 
     def end_samples(self) -> None:
-        """Bring the drive's process data back."""
+        """Bring the drive's process data back; no speed is watched any more."""
+        self.fastest_rad_s = math.inf
         sending, self._sending = self._sending, None
         if sending is not None:
             sending.__exit__(None, None, None)
@@ -242,8 +251,10 @@ class SpeedLoopDrive(TorqueDrive):
         """Let time pass; writes the steps that are due, and asks for samples where the drive does not send them."""
         clock = self.node.connection.clock
         end = clock.now() + seconds
-        while self._recording:
+        while self._recording or self._watches:
             self.oscillation.check(f"node {self.node.node}")
+            if self._watches:
+                self._check_speed()
             while self._due and self._due[0][0] - clock.now() < RESOLUTION_S:
                 speed = self._due.pop(0)[1]
                 if self._due and self._due[0][0] - clock.now() < RESOLUTION_S:
@@ -253,13 +264,44 @@ class SpeedLoopDrive(TorqueDrive):
                 self._written.append((0.5 * (before + clock.now()), self._counts(speed) * self.rad_s_per_count))
             if not self.sends:
                 self._ask()
-            until = min([end, *(at for at, _ in self._due[:1])])
-            left = (min(until, clock.now() + POLL_PERIOD_S) if not self.sends else until) - clock.now()
+            next_s = clock.now() + (POLL_PERIOD_S if self._recording and not self.sends else LOOK_S)
+            left = min([end, next_s, *(at for at, _ in self._due[:1])]) - clock.now()
             if left > 0.0:
                 self.node.connection.wait(left)
             if end - clock.now() < RESOLUTION_S:
                 break
         super().wait(max(0.0, end - clock.now()))
+
+    @property
+    def _watches(self) -> bool:
+        return self.may_be_energised and self.fastest_rad_s < math.inf
+
+    def _see(self, t_s: float, counts: float) -> None:
+        """Keep the positions of the last :data:`SPEED_S`."""
+        self._seen.append((t_s, counts))
+        while t_s - self._seen[0][0] > SPEED_S:
+            self._seen.popleft()
+        self._seen_s = self.node.connection.clock.now()
+
+    def _check_speed(self) -> None:
+        """Raise LimitExceeded, DriveTimeout: the shaft is too fast by its last samples, or none come; else return."""
+        where, now = f"node {self.node.node}", self.node.connection.clock.now()
+        self._seen_s = min(self._seen_s, now)  # the first sample is waited for from here on
+        if self.sends and now - self._seen_s > SILENT_S:
+            raise DriveTimeout(
+                f"no sample of the shaft's position came for {1e3 * (now - self._seen_s):.0f} ms", where=where,
+                likely="the bus is busy", hint="leave the bus to this program, then run the command again",
+            )  # fmt: skip
+        if not self._seen or (seconds := self._seen[-1][0] - self._seen[0][0]) < 0.4 * SPEED_S:
+            return
+        counts = self._seen[-1][1] - self._seen[0][1]
+        counts -= round(counts / 2.0**32) * 2.0**32
+        speed = 2.0 * math.pi * abs(counts / self.counts_per_turn) / seconds
+        if speed > self.fastest_rad_s:
+            raise LimitExceeded(
+                "speed", speed, self.fastest_rad_s, "rad/s", where=where, likely="the drive's speed loop runs away",
+                hint="tune it by the maker's own set-up; the gains are restored, and nothing was learned",
+            )  # fmt: skip
 
     def _ask(self) -> None:
         values, at = {}, {}
@@ -268,6 +310,9 @@ class SpeedLoopDrive(TorqueDrive):
             values[item] = self.node.get(item)
             at[item] = 0.5 * (before + self.node.connection.clock.now())
         asked, flows = self.asked or (self._current.item, self._current.item)
+        self._see(at[POSITION], values[POSITION])
+        if not self._recording:
+            return
         row = values[POSITION], values[self._current.item], values[asked], values[flows]
         self._take(at[POSITION], *row, at[asked] - at[self._current.item])
 

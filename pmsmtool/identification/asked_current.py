@@ -182,15 +182,22 @@ class _Answers:
         return AskedLoop(loop, (of_K_p, of_K_i, rate))
 
 
-def shows_asked(record: StepRecord, loop: SpeedLoop, emf: Emf) -> bool:
-    """Return whether what the drive shows beside the current surely is what its loop asks for, in the same unit.
+def asked_share(record: StepRecord, loop: SpeedLoop, emf: Emf) -> float:
+    """Return by which share of the current what is asked for exceeds what flows; NaN where only one is shown.
 
     ``loop`` is what the response alone says, ``emf`` what the EMF is assumed to take.
     """
     if record.asked_a is None:
-        return False
-    share = _Answers(record, record.asked_a, loop.K_p_per_J).share(emf.corner_rad_s)
-    return LEAST_SHARE * emf.share < share < MOST_SHARE
+        return math.nan
+    return _Answers(record, record.asked_a, loop.K_p_per_J).share(emf.corner_rad_s)
+
+
+def shows_asked(shares: Sequence[float], emf: Emf) -> bool:
+    """Return whether what the drive shows beside the current surely is what its loop asks for, in the same unit.
+
+    ``shares`` are those of records with the same gains: short steps at a small current leave much noise in one.
+    """
+    return LEAST_SHARE * emf.share < sum(shares) / len(shares) < MOST_SHARE
 
 
 def fit_asked_current(record: StepRecord, loop: SpeedLoop) -> AskedLoop | None:

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
-from pmsmtool.drive.guard import WATCH_S, GuardedDrive
+from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive
 from pmsmtool.drive.motion_objects import allowed, speed_limits
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
 from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
-from pmsmtool.identification.asked_current import fit_asked_current, shows_asked
+from pmsmtool.identification.asked_current import asked_share, fit_asked_current, shows_asked
 from pmsmtool.identification.learned_gains import BANDWIDTH_DOUBT, NO_DOUBT, Observation, emf_doubt, lag_doubt
 from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop, StepRecord, fit_speed_loop, phase_margin_rad
 from pmsmtool.machine.machine_file import MachineFile
@@ -34,6 +34,8 @@ from pmsmtool.measurement.changed_gains import (
 from pmsmtool.measurement.speed_unit import find_speed_unit
 from pmsmtool.units import rad_s_from_rpm
 
+GAIN_LITTLE_DOWN = 0.85
+"""First change of the gain where 0.7 of it would leave too little margin beside an integral part of its own."""
 INTEGRAL_DOWN, LITTLE_DOWN = 0.8, 0.9
 """First change of an integral part: where it is a time, its gain rises by 1.25, less where the margin needs it."""
 FURTHER_DOWN = 0.5
@@ -71,8 +73,8 @@ LEAST_AT_REST = 40
 SPEED_SHARE = 0.4
 """Speed limit where none is asked for, of the largest speed of the machine: no field weakening."""
 DURATION_S = 120.0
-SEEN_S = 2.0 * WATCH_S
-"""A speed beyond its limit is seen and the voltage off within this time."""
+SEEN_S = 0.03
+"""A speed beyond its limit is seen in the samples, and the voltage off, within this time."""
 REST_S, REST_RAD = 0.3, 2e-3
 ROUNDING = 1.0 / math.sqrt(12.0)
 
@@ -91,7 +93,7 @@ class LearnedLoop:
 
 
 def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: float, speed_max_rad_s: float) -> float:
-    """Return the largest current that needs two checks of the guard from the largest speed of the steps to the limit.
+    """Return the largest current that needs :data:`SEEN_S` from the largest speed of the steps to the limit.
 
     The drive's speed loop keeps the speed, also when the tool is dead; this is for a loop that runs away. A drive with
     a speed limit of its own keeps it; of any other the current is cut.
@@ -152,6 +154,8 @@ def learn_speed_loop(
         drive.send_samples()
         with contextlib.ExitStack() as last:
             last.callback(drive.end_samples)
+            limits_speed = allowed(drive.node, speed_limits(drive.node)) is not None
+            drive.fastest_rad_s = envelope.speed_max_rad_s * (OVERSHOOT if limits_speed else 1.0)
             last.callback(guard.quick_stop)
             return _Learner(guard, drive, put, emf, say).run(gain, integral)
 
@@ -159,10 +163,12 @@ def learn_speed_loop(
 def _margin(own: Observation, worst: tuple[float, float]) -> float:
     """Return the least phase margin (rad) where K_p and K_i may have changed by these ratios, whatever the form.
 
-    What is asked for shows the gains without the inverter's dead time, which makes less of them at a small current.
+    The inverter's dead time makes less of K_p at a small current, so that of the response counts, too. A current loop
+    has an integral, so that K_i keeps what is asked for: that one is used where it is known.
     """
+    K_i, lag_s = own.loops[-1].K_i_per_J, max(loop.lag_s for loop in own.loops)
     return min(
-        phase_margin_rad(loop.K_p_per_J * p, loop.K_i_per_J * i, loop.lag_s)
+        phase_margin_rad(loop.K_p_per_J * p, K_i * i, lag_s)
         for loop in own.loops for p in (1.0, worst[0]) for i in (1.0, worst[0], worst[1])
     )  # fmt: skip
 
@@ -227,6 +233,7 @@ class _Learner:
         self.low, self.span = LOW_SHARE * limit, (HIGH_SHARE - LOW_SHARE) * limit
         self.bandwidth, self.hold_s, self.settle_s = FIRST_BANDWIDTH, HOLD_TIMES / FIRST_BANDWIDTH, SETTLE_S
         self.notes: list[str] = []
+        self.shares: list[float] = []
         self.asks = False
 
     def run(self, gain: GainObject, integral: GainObject) -> LearnedLoop:
@@ -249,7 +256,8 @@ class _Learner:
         own = self._observe(f"with steps held for {1e3 * self.hold_s:.0f} ms", step, counts, own.loop)
         drive.oscillation.limit_a = TRIP * max(drive.oscillation.largest_a, drive.current_count_a)
         half = self._observe("with steps of half the size", 0.5 * step, counts, own.loop, own.loop.lag_s)
-        gain_changed = self._changed(gain, DOWN, own, (DOWN, DOWN), step, counts)
+        down = DOWN if _margin(own, (DOWN, DOWN)) >= LEAST_MARGIN_DOWN_RAD else GAIN_LITTLE_DOWN
+        gain_changed = self._changed(gain, down, own, (down, down), step, counts)
         little = _margin(own, (1.0, 1.0 / INTEGRAL_DOWN)) < LEAST_MARGIN_RAD
         ratio = LITTLE_DOWN if little else INTEGRAL_DOWN
         integral_changed = [self._changed(integral, ratio, own, (1.0, 1.0 / ratio), step, counts)]
@@ -337,7 +345,8 @@ class _Learner:
             K_p, K_i, rate = map(math.hypot, emf_doubt(low, high, most), placed)
             model_std = K_p, K_i, rate
         if lag_s is None:
-            self.asks = shows_asked(record, loop, self.emf)
+            self.shares.append(asked_share(record, loop, self.emf))
+            self.asks = shows_asked(self.shares, self.emf)
         asked = fit_asked_current(record, loop) if self.asks else None
         peak = float(np.abs(record.current_a).max())
         found = Observation(counts[GAIN], counts[INTEGRAL], loop, peak / self.drive.rated_apk, model_std, asked)

@@ -21,6 +21,8 @@ from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveFault, LimitExceeded, SafetyRefusal
 from pmsmtool.flash.gain_journal import any_left
+from pmsmtool.identification.asked_current import AskedLoop
+from pmsmtool.identification.learned_gains import Observation
 from pmsmtool.identification.speed_loop_response import SpeedLoop
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.measurement import changed_gains, learn_gains, learn_position_gain
@@ -32,6 +34,8 @@ from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import COMMON, HEARTBEAT, Row, identity, write_eds
 
 SEED = 4
+MARGIN_TOL_RAD = math.radians(0.8)
+"""Of a predicted phase margin; measured 0.4 degrees."""
 SCALE_TOL = 0.05
 """Largest error of a position gain (relative); measured 0.01."""
 GAIN, INTEGRAL = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"
@@ -264,6 +268,17 @@ def test_a_limit_that_stops_the_move_is_exit_code_5_and_the_table_is_told(
         code, printed, said = bench.learn(tool, GAIN, INTEGRAL, "position.K_p_per_s=0x60FB:01")
         assert code == 5 and "travel" in said and not any_left()
     assert "position.K_p_per_s" in printed and "outside the limit" in printed
+
+
+def test_the_predicted_margin_counts_on_the_integral_part_that_the_loop_asks_for() -> None:
+    """At 0.2 of its rated current the response alone showed a K_i 46 % too large: 35 degrees."""
+    response = SpeedLoop(107.6, 6490.0, 3.73e-3, 1e-3, 0.02)
+    asked = AskedLoop(replace(response, K_p_per_J=107.0, K_i_per_J=4753.0, lag_s=2e-3), (0.02, 0.02, 0.02))
+    own = Observation(7174.0, 251.0, response, asked=asked)
+    margin = learn_gains._margin(own, (1.0, 1.0 / learn_gains.LITTLE_DOWN))
+    assert margin == pytest.approx(math.radians(42.0), abs=MARGIN_TOL_RAD) and margin > learn_gains.LEAST_MARGIN_RAD
+    alone = learn_gains._margin(replace(own, asked=None), (1.0, 1.0 / learn_gains.LITTLE_DOWN))
+    assert alone == pytest.approx(math.radians(35.0), abs=MARGIN_TOL_RAD)
 
 
 def test_an_oscillation_trips() -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -22,7 +23,7 @@ from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.drive.set_point import ACKNOWLEDGE_S, FOLLOWING_ERROR, POSITION_DEMAND, TARGET_POSITION, start_move
-from pmsmtool.drive.speed_loop_drive import LARGEST_COUNT, OSCILLATION_SAMPLES, Oscillation, SpeedLoopDrive
+from pmsmtool.drive.speed_loop_drive import LARGEST_COUNT, OSCILLATION_SAMPLES, POSITION, Oscillation, SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.motion_objects import MotionObject
 from pmsmtool.drive_maps.shipped_maps import load_family
@@ -362,6 +363,35 @@ def test_an_oscillation_ends_the_record() -> None:
         assert drive.node.connection.clock.now() < 0.1
         drive.end_excitation()
         drive.wait(0.1)
+
+
+def test_a_shaft_too_fast_by_its_samples_ends_a_wait_before_the_guard_looks() -> None:
+    """`map learn` gives a drive without a speed limit as much current as this leaves time for."""
+    for speed, error, within_s in ((19.0, None, 1.0), (21.0, LimitExceeded, 0.02)):
+        with speed_loop() as (table, drive):
+            clock = drive.node.connection.clock
+            began = clock.now()
+
+            def counts(clock: Any = clock, began: float = began, speed: float = speed) -> float:
+                passed = 2**31 - 10 + speed / (2.0 * math.pi) * COUNTS * (clock.now() - began)
+                return (round(passed) + 2**31) % 2**32 - 2**31
+
+            table.shown[POSITION] = counts
+            drive.sends, drive.may_be_energised, drive.fastest_rad_s = False, True, 20.0
+            with contextlib.nullcontext() if error is None else pytest.raises(error, match="speed"):
+                drive.wait(0.2)
+            assert clock.now() - began < within_s
+            drive.may_be_energised = False
+
+
+def test_a_drive_that_sends_no_more_samples_is_not_left_alone() -> None:
+    with speed_loop() as (_, drive):
+        drive.sends, drive.may_be_energised, drive.fastest_rad_s = True, True, 20.0
+        began = drive.node.connection.clock.now()
+        with pytest.raises(DriveTimeout, match="no sample"):
+            drive.wait(1.0)
+        assert drive.node.connection.clock.now() - began < 0.07
+        drive.may_be_energised = False
 
 
 @pytest.mark.parametrize("start", [0, 2**31 - 5, -(2**31) + 5])

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from types import SimpleNamespace
 
 import numpy as np
@@ -87,7 +88,8 @@ def stairs_drive(bus: Bus, monkeypatch: pytest.MonkeyPatch) -> SpeedLoopDrive:
     supervision = SimpleNamespace(check=lambda: None)
     drive.node = SimpleNamespace(node=1, connection=bus, get=bus.transfer, put=bus.transfer, supervision=supervision)  # type: ignore[assignment]
     drive.oscillation, drive.sends, drive.period_s, drive.rad_s_per_count = Oscillation(), False, PERIOD_S, 0.5
-    drive.counts_per_turn, drive._polled, drive.asked = 4000.0, (), ()
+    drive.counts_per_turn, drive._polled, drive.asked, drive.may_be_energised = 4000.0, (), (), False
+    drive._seen, drive._seen_s = deque(), 0.0
     drive._current = SimpleNamespace(item=object(), per_count=0.1)  # type: ignore[assignment]
     monkeypatch.setattr(SpeedLoopDrive, "check_operating", lambda self: None)
     return drive

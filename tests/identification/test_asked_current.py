@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pmsmtool.identification.asked_current import fit_asked_current, shows_asked
+from pmsmtool.identification.asked_current import asked_share, fit_asked_current, shows_asked
 from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop, StepRecord
 from pmsmtool.measurement.learn_gains import TICK_S, staircase
 
@@ -56,11 +56,17 @@ def test_what_is_asked_for_tells_the_gains_whatever_the_current_loop_does() -> N
     record = recorded()
     jitter = np.random.default_rng(0).normal(0.0, JITTER_S, len(record.t_s))
     for one in (record, replace(record, t_s=np.sort(record.t_s + jitter))):
-        assert shows_asked(one, RESPONSE, EMF)
+        assert shows_asked([asked_share(one, RESPONSE, EMF)], EMF)
         found = fit_asked_current(one, RESPONSE)
         assert found is not None
         assert found.loop.K_p_per_J == pytest.approx(A, rel=K_P_ERROR)
         assert found.loop.K_i_per_J == pytest.approx(B, rel=K_I_ERROR)
     assert record.asked_a is not None
     for other in (record.current_a, math.sqrt(2.0) * record.asked_a, None):  # the same object, rms for peak, none
-        assert not shows_asked(replace(record, asked_a=other), RESPONSE, EMF)
+        assert not shows_asked([asked_share(replace(record, asked_a=other), RESPONSE, EMF)], EMF)
+
+
+def test_records_together_say_whether_a_current_is_asked_for() -> None:
+    """Of one drive at 0.17 of its rated current two records gave these: the second one alone is none."""
+    assert shows_asked([0.085, -0.037], Emf(0.052, 71.0))
+    assert not shows_asked([0.03, -0.042], Emf(0.052, 71.0)) and not shows_asked([math.nan, 0.1], EMF)
