@@ -50,7 +50,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
     if eds is not None:
         bus = rehearsal_bus(bus, eds=eds)
     with open_node(bus, within_s=LOOKING_S) as node:
-        found = examine(node, given)
+        found = examine(node, given, may_try=eds is not None)
     out.result("caps", _facts(found), lambda: _lines(found, out.verbosity > 0, asked=eds is None))
     for name, why in found.drive_map.not_written(BY_NAME).items():
         if name not in found.drive_map.left_out:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.bus.clock import VirtualClock
 from pmsmtool.bus.connection import Connection
 from pmsmtool.bus.nmt import NmtCommand, NmtState, reset_node, send_nmt
 from pmsmtool.bus.sdo import Retry, SdoChannel
@@ -72,6 +71,8 @@ class DriveNode:
         Confirmed transfers.
     supervision : Supervision
         Heartbeat, emergencies, other masters.
+    may_try : bool
+        Whether :meth:`takes` may write: the drive is simulated for a rehearsal alone.
     before_write : callable or None
         Told of every object that :meth:`put` and :meth:`write_bytes` are about to change.
     before_close : list of callable
@@ -85,6 +86,7 @@ class DriveNode:
         self.supervision = Supervision(connection, node)
         self.sdo = SdoChannel(connection, node, check=self.supervision.check)
         self.sdo.slow_objects[objects.STORE_ALL] = STORE_TIMEOUT_S
+        self.may_try = False
         self.before_write: Watcher | None = None
         self.before_close: list[Callable[[], object]] = []
         self._lengths: dict[tuple[int, int], int] = {}
@@ -129,9 +131,9 @@ class DriveNode:
         return found.decode(data)
 
     def takes(self, item: DriveObject, *values: float) -> bool:
-        """Whether an object takes values, and its own. On virtual time they are written; a real drive is only read."""
+        """Whether an object takes values, and its own, where that may be tried; else whether it is there."""
         held = self.held(item)
-        if held is None or not isinstance(self.connection.clock, VirtualClock):
+        if held is None or not self.may_try:
             return held is not None
         try:
             for value in (*values, held):

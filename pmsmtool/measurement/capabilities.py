@@ -355,8 +355,8 @@ def choose_map(identity: Identity, given: DriveMap | None) -> DriveMap:
     return given or family_of(*identity.vendor_product) or load_family(GENERIC)
 
 
-def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
-    """Ask a drive what it has; only reads.
+def examine(node: DriveNode, given: DriveMap | None = None, *, may_try: bool = False) -> Capabilities:
+    """Ask a drive what it has; only reads, but for what may be tried.
 
     Parameters
     ----------
@@ -364,8 +364,10 @@ def examine(node: DriveNode, given: DriveMap | None = None) -> Capabilities:
         The drive; its map is replaced by the chosen one.
     given : DriveMap, optional
         The map to use; default: by the drive's identity.
+    may_try : bool
+        Whether what a push writes is written and taken back, to know whether the drive takes it: for a rehearsal.
     """
-    node.map = given or node.map
+    node.map, node.may_try = given or node.map, may_try
     identity = node.identity()
     node.map = choose_map(identity, given)
     named = identity.vendor != UNKNOWN_VENDOR and node.map.is_for(*identity.vendor_product)

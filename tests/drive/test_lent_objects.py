@@ -329,6 +329,7 @@ def test_the_last_pdo_that_can_be_lent_is_expected(
         table.objects |= {key: data for key, data in received(3, timer=False).items() if 3 not in numbers}
         table.fixed = dict(fixed)
         before = dict(table.objects)
+        node.may_try = True
         assert expects_pdos(node) == any((0x1400 + number - 1, 5) not in fixed for number in numbers)
         cob_id = expect_pdo(node, 250)
         if taken is None:
