@@ -210,12 +210,12 @@ def kept(job: tuple[str, int, str], drive: MachineFile, choice: Choice) -> Measu
     return found
 
 
-def measured(drive: MachineFile) -> Measured:
+def measured(drive: MachineFile, accuracy: float | None = None) -> Measured:
     """Run the experiments on a simulated drive; return traces, nameplate and time on the bus (s)."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "drive.toml"
         path.write_text(dump_machine_file(drive, embed_flux_map=drive.flux_map is not None), encoding="utf-8")
-        return _measured(path)
+        return _measured(path, accuracy)
 
 
 def evaluated(traces: dict[str, Trace], nameplate: MachineFile, tolerance: SensorTolerance | None = None) -> Evaluation:
@@ -224,7 +224,7 @@ def evaluated(traces: dict[str, Trace], nameplate: MachineFile, tolerance: Senso
     return evaluate(traces, inverter.T_s, T_ref_c=T_ref_c, U_dc_v=inverter.U_dc_v, tolerance=tolerance).whole()
 
 
-def _measured(path: Path) -> Measured:
+def _measured(path: Path, accuracy: float | None) -> Measured:
     traces: dict[str, Trace] = {}
     with connect("pmsmsim", f"{path}?nv=:memory:") as connection:
         drive = CanopenDrive(connection, 1)
@@ -239,7 +239,7 @@ def _measured(path: Path) -> Measured:
         )
         start = connection.clock.now()
         with guarded(drive, envelope) as guard:
-            measurement = Measurement(guard, limits, traces.__setitem__, lambda text: None)
+            measurement = Measurement(guard, limits, traces.__setitem__, lambda text: None, accuracy=accuracy)
             measurement.run(ELECTRICAL)
         seconds = connection.clock.now() - start
         drive.close()

@@ -479,6 +479,7 @@ class Measurement:
             if effort is efforts[-1] or self._enough_levels(trace, noise):
                 break
             self.say("  the accuracy asked for is not reached: more levels")
+            self._spare_supply()  # the winding is warmer by now: what the link just bore can trip it
         return resistance_of(trace, noise)
 
     def _enough_levels(self, trace: Trace, noise: Noise) -> bool:

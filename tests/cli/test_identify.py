@@ -52,7 +52,8 @@ def profile(name: str, **simulation: Any) -> str:
 def test_a_record_that_is_read_on_a_slow_bus_leaves_room_for_the_heartbeat(tool: Tool) -> None:
     """Its segments have the lower identifier: the drive missed the heartbeat, and switched off."""
     channel = "interior-2k2?nv=:memory:&bitrate=125000"
-    code, out, err = tool("identify", "L", "-i", "pmsmsim", "-c", channel, "-b", "125000", "--yes", "--json")
+    slow = ("-i", "pmsmsim", "-c", channel, "-b", "125000")
+    code, out, err = tool("identify", "L", *slow, "--accuracy", "0.01", "--yes", "--json")
     assert code == 0, err
     found = {row["name"] for row in json.loads(out)["values"]}
     assert {"L_d_h", "L_q_h"} <= found

@@ -214,11 +214,16 @@ def test_killed_with_a_changed_gain_the_next_connection_restores(
 
 
 @pytest.mark.chain
-def test_a_fit_waits_until_the_voltage_is_off(bench: Bench, tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the wall clock the heartbeat stayed away meanwhile, and the drive left operation at the first fit (exit 4)."""
+def test_a_run_that_ends_with_an_error_leaves_no_journal_and_no_fit_was_made_under_voltage(
+    bench: Bench, tool: Tool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The gains were back, and the journal refused every later command once the drive was set up anew (exit code 5).
+
+    On the wall clock the heartbeat stayed away during a fit, and the drive left operation at the first (exit 4).
+    """
+    before, change, begin = bench.counts(), GuardedDrive.change, GuardedDrive.begin
     guards: list[GuardedDrive] = []
     energised: list[bool] = []
-    begin = GuardedDrive.begin
 
     def noted(self: GuardedDrive, **how: Any) -> None:
         guards.append(self)
@@ -228,30 +233,17 @@ def test_a_fit_waits_until_the_voltage_is_off(bench: Bench, tool: Tool, monkeypa
         energised.append(guards[0]._drive.may_be_energised)
         return SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02)
 
-    monkeypatch.setattr(GuardedDrive, "begin", noted)
-    monkeypatch.setattr(learn_gains, "fit_speed_loop", fit)
-    monkeypatch.setattr(learn_gains, "LEAST_S", 0.6)
-    bench.learn(tool)
-    assert energised and not any(energised)
-
-
-@pytest.mark.chain
-def test_a_run_that_ends_with_an_error_leaves_no_journal(
-    bench: Bench, tool: Tool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The gains were back, and the journal refused every later command once the drive was set up anew (exit code 5)."""
-    before, change = bench.counts(), GuardedDrive.change
-
     def fails(self: GuardedDrive, item: Any, data: bytes) -> None:
         change(self, item, data)
         raise DriveFault("the drive left operation during a measurement")
 
-    loop = SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02)
-    monkeypatch.setattr(learn_gains, "fit_speed_loop", lambda *arguments, **options: loop)
+    monkeypatch.setattr(GuardedDrive, "begin", noted)
+    monkeypatch.setattr(learn_gains, "fit_speed_loop", fit)
     monkeypatch.setattr(learn_gains, "LEAST_S", 0.6)
     monkeypatch.setattr(GuardedDrive, "change", fails)
     code, _, said = bench.learn(tool)
     assert code == 4 and "left operation" in said and bench.counts() == before and not any_left()
+    assert energised and not any(energised)
 
 
 @pytest.mark.chain

@@ -33,7 +33,7 @@ def identified(folder: Path, quantities: tuple[str, ...]) -> tuple[RunDirectory,
         drive = CanopenDrive(connection, 1)
         nameplate = nameplate_of(drive, "bench")
         try:
-            request = IdentifyRequest(quantities=quantities)
+            request = IdentifyRequest(quantities=quantities, accuracy=0.01)
             stage = identify(run, drive, request, lambda lines: None, lambda text: None, known=(nameplate, "bench"))
         finally:
             assert is_safe(drive.node.state()) and not drive.may_be_energised

@@ -26,7 +26,7 @@ INSTANT_S, LAG_S = 4.75e-6, 1.03e-6
 @cache
 def _found() -> tuple[dict[str, Trace], MachineFile, Evaluation, dict[str, float], float]:
     drive = drawn("", SEED, "timing")
-    traces, nameplate, _ = measured(drive)
+    traces, nameplate, _ = measured(drive, accuracy=0.01)
     evaluation = evaluated(traces, nameplate)
     share = threshold_share({"profile": "", "seed": SEED, "block": "timing"})
     return traces, nameplate, evaluation, truth_of(drive, evaluation), share
@@ -77,7 +77,7 @@ def test_an_old_encoder_angle_is_in_the_intervals() -> None:
     """It is read as a late sample, which left L 2.8 % too small, 1.9 times the interval."""
     drive = drawn("", 171006, "ideal")
     drive = replace(drive, simulation={**drive.simulation, "encoder_latency_s": AGE_S})
-    traces, nameplate, _ = measured(drive)
+    traces, nameplate, _ = measured(drive, accuracy=0.01)
     evaluation = evaluated(traces, nameplate)
     truth = truth_of(drive, evaluation)
     assert evaluation.resistance is not None and evaluation.inductance is not None and evaluation.flux is not None

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.errors import ConfigError, IdentificationError
+from pmsmtool.errors import ConfigError, IdentificationError, Partial
 from pmsmtool.experiments.rotation import SLOWEST_STEP_S, STEP_RAD, dwell_within
 from pmsmtool.files import data_folder
 from pmsmtool.identification.request import IdentifyRequest
@@ -23,7 +23,7 @@ from pmsmtool.measurement.limits import LEAST_CURRENT, LEAST_SPEED_SHARE, Limits
 from pmsmtool.params.catalogue import BY_NAME
 
 WEAK_SUPPLY = 0.01
-"""Of L_d, L_q, psi_f and J behind 25 ohm: 0.6, 0.3, 0.2 and 0.3 % were found."""
+"""Of L_d, L_q, psi_f and J behind 25 ohm: 0.4, 0.4, 0.6 and 0.4 % were found."""
 GIVEN = {"I_nom_apk": 5.0, "i_max_apk": 6.0, "omega_max_rad_s": 300.0, "V_max_v": 28.0}
 
 
@@ -52,10 +52,14 @@ def test_a_weak_supply_is_asked_for_less_current_first_and_for_less_speed_then()
 
 @pytest.mark.chain
 def test_a_drive_on_a_supply_in_current_limit_is_identified(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """210 V behind 25 ohm: the test current takes 31 % of the link. Before, the run over speeds ended in 0x3220."""
+    """210 V behind 25 ohm: the test current takes 31 % of the link. Before, the run over speeds ended in 0x3220.
+
+    So did a second sweep of levels, where the first one leaves R less accurate than asked for.
+    """
     monkeypatch.chdir(tmp_path)
-    outcome = CliRunner().invoke(cli, ["identify", "--sim", "jercic-2017?U_dc_source_ohm=25", "--yes", "--json"])
-    assert outcome.exit_code == 0, outcome.exception
+    asked = ["--accuracy", "0.01", "--sim", "jercic-2017?U_dc_source_ohm=25", "--yes", "--json"]
+    outcome = CliRunner().invoke(cli, ["identify", *asked])
+    assert isinstance(outcome.exception, Partial), "the accuracy of R alone is not reached"
     assert "the DC link gives way under 378 W: what follows takes at most 159 W" in outcome.stderr
     facts = json.loads(outcome.stdout)
     found = {value["name"]: value for value in facts["values"]}

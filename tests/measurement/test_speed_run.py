@@ -78,14 +78,14 @@ SLOW_AND_LIGHT = 70189
 @pytest.mark.chain
 def test_a_q_current_that_settles_slowly_does_not_stop_the_shaft() -> None:
     drive = drawn("", SLOW_AND_LIGHT, "ideal")
-    traces, nameplate, _ = measured(drive)
+    traces, nameplate, _ = measured(drive, accuracy=0.01)
     speeds = traces["speeds"]
     driven = np.abs(speeds["i_q_a"]) > np.abs(speeds["i_d_a"])
     w = np.abs(speeds["omega_e_rad_s"])
     change = np.abs(speeds["omega_second_rad_s"] - speeds["omega_first_rad_s"]) / w
-    assert np.count_nonzero(driven) == 8
-    assert float(np.max(change)) < 0.2  # measured 0.102; 0.50 with a current that left settling out of account
-    assert float(np.min(w[driven])) > 0.3 * float(np.max(w))  # measured 0.32; 0.09
+    assert np.count_nonzero(driven) == 4
+    assert float(np.max(change)) < 0.2  # measured 0.091; 0.50 with a current that left settling out of account
+    assert float(np.min(w[driven])) > 0.3 * float(np.max(w))  # measured 0.35; 0.09
     evaluation = evaluated(traces, nameplate)
     truth = truth_of(drive, evaluation)
     for name, found in evaluation.estimates().items():
