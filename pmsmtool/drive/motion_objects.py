@@ -470,6 +470,11 @@ def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, floa
     return None
 
 
+def limits_speed(node: DriveNode) -> bool:
+    """Whether the drive has a limit of the speed of its own."""
+    return allowed(node, speed_limits(node)) is not None
+
+
 def held_current_limits(node: DriveNode, rated: float) -> list[tuple[Quantity, float]]:
     """Return the limits of the current that the drive has, with what they now allow (A peak)."""
     found = (allowed(node, iter((limit,))) for limit in current_limits(node, rated))

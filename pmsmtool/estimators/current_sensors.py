@@ -81,7 +81,7 @@ def estimate_noise(trace: Trace) -> Noise:
 
 
 MEAN_SAMPLES = 512
-"""Samples of a mean of a pair, where a trace does not say."""
+"""Samples of a mean, where a trace does not say."""
 LEAST = 0.002
 """Largest gain over the mean up to which nothing is corrected: leaves 0.1 % of R or L, a tenth of their tolerance."""
 SURE = 4.0

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.current_sensors import Noise, SensorMismatch, estimate_mismatch
+from pmsmtool.estimators.current_sensors import MEAN_SAMPLES, Noise, SensorMismatch, estimate_mismatch
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.resistance import ResistanceResult, normalised
@@ -24,8 +24,6 @@ from pmsmtool.trace import Trace
 STAGE = "phase check"
 CONNECTED_SIGMA = 10.0
 """Multiples of the noise of a mean that a current must exceed."""
-MEAN_SAMPLES = 512
-"""Samples of a mean, where a trace does not say."""
 OPEN_FRACTION = 0.2
 """Fraction of the other phases' current below which a phase counts as open, and of the command all of them."""
 BALANCE_LIMIT = 0.10

@@ -12,7 +12,7 @@ import numpy as np
 
 from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive
-from pmsmtool.drive.motion_objects import allowed, speed_limits
+from pmsmtool.drive.motion_objects import limits_speed
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
 from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
@@ -99,7 +99,7 @@ def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: 
     a speed limit of its own keeps it; of any other the current is cut.
     """
     acceleration = largest_acceleration(machine, i_max_apk)
-    if allowed(drive.node, speed_limits(drive.node)) is not None or acceleration is None:
+    if limits_speed(drive.node) or acceleration is None:
         return i_max_apk
     room = (1.0 - HIGH_SHARE) * speed_max_rad_s
     return i_max_apk * min(1.0, room / (acceleration * SEEN_S))
@@ -154,8 +154,7 @@ def learn_speed_loop(
         drive.send_samples()
         with contextlib.ExitStack() as last:
             last.callback(drive.end_samples)
-            limits_speed = allowed(drive.node, speed_limits(drive.node)) is not None
-            drive.fastest_rad_s = envelope.speed_max_rad_s * (OVERSHOOT if limits_speed else 1.0)
+            drive.fastest_rad_s = envelope.speed_max_rad_s * (OVERSHOOT if limits_speed(drive.node) else 1.0)
             last.callback(guard.quick_stop)
             return _Learner(guard, drive, put, emf, say).run(gain, integral)
 

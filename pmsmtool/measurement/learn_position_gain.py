@@ -14,7 +14,8 @@ from dataclasses import replace
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
-from pmsmtool.drive.motion_objects import allowed, speed_limits
+from pmsmtool.drive.guard import WATCH_S
+from pmsmtool.drive.motion_objects import limits_speed
 from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.errors import IdentificationError, LimitExceeded, NotAvailable, SafetyRefusal
 from pmsmtool.experiments.move import record_move
@@ -30,6 +31,7 @@ from pmsmtool.measurement.changed_gains import (
     named_addresses,
     refuse_unsafe,
 )
+from pmsmtool.measurement.learn_gains import SEEN_S
 
 POSITION, FORWARD = "position.K_p_per_s", "position.velocity_ff"
 SPEED_RAD_S, RAMP_S, EVEN_S = 2.0 * math.pi, 0.25, 3.0
@@ -40,9 +42,9 @@ SHORT_RAD = 0.5 * math.pi
 REST_S = 1.0
 TRAVEL = 1.3
 """Largest travel, of the way."""
-UNWATCHED_SHARE = 0.3
+UNWATCHED_SHARE = SEEN_S / (2.0 * WATCH_S)
 """Current of the moves of a drive without a speed limit, of that of the steps: their speed is watched by the guard's
-looks alone, which need 0.1 s where the samples need 0.03."""
+looks alone, and two of them take longer than the samples need."""
 BEHIND = 0.5
 """Largest lag of a shaft that does not follow, of the way."""
 SEEN, AIM, GROWTH, FORWARD_MOVES = 0.3, 0.8, 8.0, 10
@@ -106,7 +108,7 @@ def _moved(
     drive.error_limit_rad = BEHIND * WAY_RAD
     lags: list[tuple[float, PositionLag]] = []
     envelope = replace(envelope, travel_rad=TRAVEL * WAY_RAD)
-    if allowed(node, speed_limits(node)) is None:
+    if not limits_speed(node):
         envelope = replace(envelope, i_max_apk=envelope.i_max_apk * UNWATCHED_SHARE)
     with changing(drive, written, envelope, say) as (guard, put):
         if forward is not None and forward.counts:
