@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pmsmtool.cli.drive_access import LOOKING_S, claimed_node, map_option, open_drive, open_node, read_map
+from pmsmtool.cli.drive_access import LOOKING_S, claimed_node, map_option, open_node, read_map
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output, table
 
@@ -47,13 +47,15 @@ def check_command(
     from pmsmtool.cia402 import HOMING_LOST
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.commissioning.first_check import check_wiring, envelope_of
+    from pmsmtool.measurement.capabilities import CapabilityLevel
+    from pmsmtool.measurement.identify import open_for_level
 
-    below = _below_full(bus, map_file)
-    if below is not None:
-        found = _check_below_full(bus, motion, out, below, machine_file)
-        _conclude(out, found)
+    given = _examined(bus, map_file)
+    if given.level not in (CapabilityLevel.FULL, CapabilityLevel.INJECT):
+        _conclude(out, _check_below_full(bus, motion, out, given, machine_file))
         return
-    with open_drive(bus) as drive:
+    with bus.connect() as connection:
+        drive = open_for_level(connection, claimed_node(connection, bus.node), given)
         stated = _stated(drive, machine_file)
         envelope = replace(
             envelope_of(stated, motion.i_max_apk, motion.speed_max_rad_s),
@@ -68,6 +70,7 @@ def check_command(
         ]
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
         found = check_wiring(drive, stated, envelope, out.note)
+        drive.close()
     _conclude(out, found, "" if machine_file else OF_THE_DRIVE)
 
 
@@ -98,14 +101,13 @@ def _conclude(out: Output, found: list[Finding], stated_by: str = "") -> None:
         raise Partial(f"not judged: {', '.join(unseen)}", hint="this drive does not show them; look at them yourself")
 
 
-def _below_full(bus: BusOptions, map_file: Path | None) -> Capabilities | None:
-    """Return what the drive has where that is less than the full level, None where all is there."""
-    from pmsmtool.measurement.capabilities import CapabilityLevel, examine
+def _examined(bus: BusOptions, map_file: Path | None) -> Capabilities:
+    """Return what the drive has."""
+    from pmsmtool.measurement.capabilities import examine
 
     with open_node(bus, within_s=LOOKING_S) as node:
         node.refuse_late()
-        found = examine(node, None if map_file is None else read_map(map_file))
-    return None if found.level in (CapabilityLevel.FULL, CapabilityLevel.INJECT) else found
+        return examine(node, None if map_file is None else read_map(map_file))
 
 
 def _check_below_full(
