@@ -266,7 +266,7 @@ class Commissioning:
             if name == "identify":
                 stage = self._compared(self._without_map(stage))
         except BaseException as error:
-            if isinstance(error, NotAvailable) and not self.stages.whole:
+            if isinstance(error, NotAvailable) and (not self.stages.whole or name in self.stages.unavailable()):
                 self._not_available(name, number, error, clock.now() - start)
                 return
             # the status says that it was interrupted, the note by what

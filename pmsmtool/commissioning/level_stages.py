@@ -44,6 +44,7 @@ from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel
 from pmsmtool.measurement.identify import OF_LEVEL, SET_UP, identify, identify_after_drive
 from pmsmtool.measurement.limits import Allow, Say
 from pmsmtool.params.parameter_set import read_parameter_set
+from pmsmtool.proof.plan import HALLS_ALONE
 from pmsmtool.proof.stage import ProofRequest, prove_stage
 from pmsmtool.report.verdict import ENCODER_SIGN
 from pmsmtool.run_directory import RunDirectory, Stage
@@ -127,7 +128,7 @@ class LevelStages:
     def unavailable(self) -> dict[str, str]:
         """Return the stages that drive and map cannot give, with the reason, as known before anything moves."""
         if self.whole:
-            return {}
+            return {} if "encoder" in self.found.features else {"prove": HALLS_ALONE}
         writing, proof = self._no_writing(), self._no_proof()
         reasons = {"flash": writing, "verify": writing, "prove": proof}
         if self.known() is None:
@@ -152,7 +153,8 @@ class LevelStages:
         run, drive, found = self.run, self.drive, self.found
         if self.injects:
             given = None if self.nameplate is None else (self.nameplate, DATA_SHEET)
-            stage = _stopped(identify(run, drive, request, allow, say, found=found, known=given), given=given)
+            asked = self._injected(request)
+            stage = _stopped(identify(run, drive, asked, allow, say, found=found, known=given), given=given)
             return stage if self.whole else replace(stage, fallbacks=(*stage.fallbacks, NO_AVERAGES))
         known = self.known()
         if known is not None:
@@ -241,6 +243,14 @@ class LevelStages:
         offset, reverse = (self.drive.read(f"encoder.{name}") for name in ("offset_rad", "reversed"))
         encoder = replace(known[0].encoder, offset_rad=offset, direction=-1 if reverse else 1)
         return replace(known[0], encoder=encoder), known[1]
+
+    def _injected(self, request: IdentifyRequest) -> IdentifyRequest:
+        """Return a request without what needs an encoder, where the drive has none."""
+        may = [name for name in (*request.quantities, "frf") if self.found.row(name, Method.INJECT).available]
+        if not may:  # a drive without its own safety: the guard says so
+            return request
+        _, given, left = self.found.choose(request.quantities, Method.INJECT)
+        return replace(request, quantities=given, left_out=left, resonance=request.resonance and "frf" in may)
 
     def _complete(self, known: Any) -> bool:
         return known is not None or self.found.level is CapabilityLevel.INJECT

@@ -24,13 +24,7 @@ from pmsmtool.identification.request import (
     steps_of,
 )
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.machine.parameters import (
-    HALLS,
-    EncoderParameters,
-    InverterParameters,
-    MachineLimits,
-    MachineParameters,
-)
+from pmsmtool.machine.parameters import HALLS, EncoderParameters, InverterParameters, MachineLimits, MachineParameters
 from pmsmtool.measurement import flux_map, frequency_response, mechanics
 from pmsmtool.measurement.limits import DURATION_S, HEADROOM, Keep, Limits, Say, Task, require_speed, unused_current
 from pmsmtool.measurement.measure import Measurement, starting_gains
@@ -80,21 +74,17 @@ def nameplate_of(drive: CanopenDrive, name: str = "") -> MachineFile:
         n_trip_rpm=read("protection.n_trip_rpm"),
         T_winding_max_c=read("protection.T_winding_max_c"),
     )
-    return MachineFile(
-        name,
-        machine,
-        inverter,
-        encoder=_encoder(read),
-        limits=limits,
-        provenance={"source": "parameter set and ratings of the drive; the measured values are in [estimate]"},
-    )
+    source = "parameter set and ratings of the drive; the measured values are in [estimate]"
+    return with_own_halls(MachineFile(name, machine, inverter, limits=limits, provenance={"source": source}), read)
 
 
-def _encoder(read: Callable[[str], float]) -> EncoderParameters:
-    """Return how the drive commutates by Hall sensors; nothing where it does not. The rest is measured."""
+def with_own_halls(known: MachineFile, read: Callable[[str], float]) -> MachineFile:
+    """Return a machine file with how the drive commutates by Hall sensors, where it does and the file does not say."""
     kind = round(read("hall.commutation"))
-    axes = [read(f"hall.{key}") if kind else None for key in HALLS[1:]]
-    return EncoderParameters(0.0, 1, None, kind or None, *axes)
+    if not kind or known.encoder.halls:
+        return known
+    stated, axes = known.encoder, (read(f"hall.{key}") for key in HALLS[1:])
+    return replace(known, encoder=EncoderParameters(stated.offset_rad, stated.direction, stated.bits, kind, *axes))
 
 
 def envelope_of(nameplate: MachineFile, request: IdentifyRequest) -> Envelope:

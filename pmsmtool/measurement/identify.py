@@ -31,7 +31,7 @@ from pmsmtool.identification.value_verdict import with_left_out
 from pmsmtool.identification.verdicts import KEYS
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.measurement import by_injection, by_pulses, by_vendor
-from pmsmtool.measurement.by_injection import nameplate_of
+from pmsmtool.measurement.by_injection import nameplate_of, with_own_halls
 from pmsmtool.measurement.by_pulses import measurable
 from pmsmtool.measurement.by_vendor import vendor_quantities
 from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, reference_capabilities
@@ -150,8 +150,8 @@ def identify(
         As the guard ends the experiment.
     """
     row, found = METHODS[method], found or reference_capabilities(drive.identity)
-    if method is Method.INJECT and known is None:
-        known = nameplate_of(drive), SET_UP
+    if method is Method.INJECT:
+        known = (nameplate_of(drive), SET_UP) if known is None else (with_own_halls(known[0], drive.read), known[1])
     with _opened_as(row.opens(found), drive, found) as own:
         task = Task(run, own, found, request, known, read_supply)
         envelope, lines = row.plan(task)

@@ -190,6 +190,10 @@ class ProofPlan:
         return ramps + sum(e.rows * e.decimation * T_s + 0.5 for e in self.experiments)
 
 
+HALLS_ALONE = "nothing predicts a drive that commutates by Hall sensors alone"
+"""Why such a drive is not proven."""
+
+
 def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
     """Return the experiments that fit a design within an envelope.
 
@@ -198,7 +202,7 @@ def plan_proof(design: Design, conditions: Conditions) -> ProofPlan:
     """
     if design["hall.commutation"] >= HallCommutation.ALONE:
         raise NotAvailable(
-            "the tool predicts no drive that commutates by Hall sensors alone",
+            HALLS_ALONE,
             hint="compare moves and records by hand; `pmsmtool caps` lists what such a drive gives",
         )
     sizes = _Sizes.of(design, conditions)

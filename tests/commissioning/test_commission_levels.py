@@ -34,10 +34,11 @@ from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, Contradiction, ExitCode, IdentificationError, NotAvailable
 from pmsmtool.files import data_folder
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.request import REPLAYED
+from pmsmtool.identification.request import REPLAYED, IdentifyRequest
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement import by_pulses
-from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, examine
+from pmsmtool.measurement.by_injection import with_own_halls
+from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, examine, reference_capabilities
 from pmsmtool.measurement.identify import SET_UP, open_for_level
 from pmsmtool.papers.closed_drive import ClosedNode
 from pmsmtool.params.parameter_set import read_parameter_set
@@ -425,6 +426,22 @@ def test_a_drive_whose_encoder_counts_backwards_gets_no_gains_and_no_proof(tmp_p
     for closed in (lambda: stages.flash(quiet, quiet), stages.verify, lambda: stages.prove(quiet, quiet, quiet)):
         with pytest.raises(NotAvailable, match="encoder sign WRONG: swap two motor leads"):
             closed()
+
+
+def test_a_drive_with_hall_sensors_alone_is_asked_for_no_angle_between_their_edges(tmp_path: Path) -> None:
+    """Its set turned the Hall sensors off: fault 0x7305 after the reset, and the roll-back failed, too."""
+    drive: Any = SimpleNamespace(identity=SimpleNamespace(node=1, vendor=1, product=1))
+    every = reference_capabilities(drive.identity)
+    assert LevelStages(_run(tmp_path), drive, every, None).unavailable() == {}
+    halls = LevelStages(_run(tmp_path), drive, replace(every, features=every.features - {"encoder"}), None)
+    asked = halls._injected(IdentifyRequest())
+    assert asked.quantities == ("R", "L", "psi", "encoder", "poles", "inverter") and not asked.resonance
+    assert list(asked.left_out) == ["mechanics"] and list(halls.unavailable()) == ["prove"]
+    held = {"hall.commutation": 2.0, "hall.axis_1_rad": 0.1, "hall.axis_2_rad": -2.0, "hall.axis_3_rad": 2.1}
+    known = load_machine_file(PROFILE)
+    own = with_own_halls(known, held.__getitem__)
+    assert own.encoder.halls == held and with_own_halls(own, {"hall.commutation": 1.0}.__getitem__) is own
+    assert with_own_halls(known, {"hall.commutation": 0.0}.__getitem__) is known
 
 
 def _run(folder: Path) -> RunDirectory:
