@@ -19,6 +19,7 @@ from pmsmtool.design.loops.speed_loop import Notch
 from pmsmtool.design.ratings import ratings_of
 from pmsmtool.design.tolerance import NORMAL_95, tolerance_box
 from pmsmtool.errors import ConfigError, DesignInfeasible
+from pmsmtool.machine.datasheet import CONVERSION
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.torque import torque_per_ampere
@@ -69,6 +70,8 @@ TORQUE_SHARE = 0.6
 """Torque of the acceleration, of the largest one beyond friction: the rest is for the loops."""
 WAY_RAD = math.pi
 """Way of the move whose following error is predicted, at these limits."""
+OF_TUNED_SPEED = ("notch at", "no notch at", "speed loop of")
+"""How notes on the speed loop of `tune` begin: the axis has another."""
 RAMP = 4.0
 """Ramp of the acceleration on a rigid shaft, in time constants J / K_p of the speed loop: torque follows to 2 %."""
 
@@ -164,6 +167,11 @@ class AxisDrive:
         """Whether its moves are limited in jerk."""
         return self.own_core or PROFILE[3] in self.offers
 
+    @property
+    def keeps_gains(self) -> bool:
+        """Whether a backup says what its loops of speed and position hold."""
+        return self.offers.issuperset(_gain_rows(self))
+
     def feeds(self, name: str) -> bool:
         """Whether a feed-forward acts as designed: it is written, or a person enters the whole axis by hand."""
         return name in self.offers or not self.offers & {CASCADE[0], PID[0]}
@@ -254,9 +262,10 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
         return made.noted(told)
     if phase >= limits.phase_deg and peak <= limits.S_db:
         return _kept(made.noted({**told, "axis_stored_gains": "kept"}), speed, position, move, drive)
+    errors = " against ".join(f"{math.degrees(error):.3g}" for error in (before, after))
     note = (
-        f"the stored gains are not kept: {phase:.3g} deg and {peak:.3g} dB over the tolerance box, asked for are "
-        f"{limits}. They would follow better: {math.degrees(before):.3g} against {math.degrees(after):.3g} deg; "
+        f"the stored gains are not kept: {phase:.3g} deg and {peak:.3g} dB over the tolerance box, of both loops "
+        f"opened at the torque; asked for are {limits}. They would follow better: {errors} deg; "
         "--axis-phase-margin-deg and --axis-peak-db allow less margin"
     )
     return made.noted({**told, "axis_stored_gains": "not kept: less margin than asked for"}, note)
@@ -367,6 +376,10 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
     hertz = design.loops["current_q"].bandwidth_rad_s / (2.0 * math.pi)
     counted = f"the margins count on a q current loop of {hertz:.3g} Hz, which the set of the axis does not write"
     notes = (*notes, f"{counted}: `tune` without --axis designs it")
+    inertia = source.estimates.get("J_kgm2")
+    if inertia is not None and inertia.method == CONVERSION:
+        stated = f"the inertia {inertia.value:.4g} kg m2 is as given, not measured"
+        notes = (*notes, f"{stated}: of the motor alone, the load is missing, and the margins do not hold with it")
     if PROFILE[3] not in drive.offers and PROFILE[0] in drive.offers:
         notes = (*notes, "no object for the jerk (0x60A4): moves are trapezoids")
     how = f"stiffest with {request.phase_margin_deg:g} deg and |S| below {request.peak_db:g} dB over the tolerance box"
@@ -386,7 +399,8 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
     # the loop of the speed alone is judged as part of the axis
     kept = {name: replace(value, loop="") if value.loop == "speed" else value for name, value in design.values.items()}
     base = replace(
-        design, request=asked, facts=facts, values=kept, notes=(*design.notes, *notes),
+        design, request=asked, facts=facts, values=kept,
+        notes=(*(note for note in design.notes if not note.startswith(OF_TUNED_SPEED)), *notes),
         loops={name: loop for name, loop in design.loops.items() if name != "speed"},
     )  # fmt: skip
     share, error = _best_forward(box, position, _own_move(base, drive), drive)

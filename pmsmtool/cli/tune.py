@@ -141,7 +141,7 @@ def tune_command(
     params_path = params_path or _params_path(path)
     refuse_source(machine, path, params_path)
     if asked.pop("axis"):
-        _axis(load_machine_file(machine), drive_map, asked, axis, path, params_path, out)
+        _axis(machine, drive_map, asked, axis, path, params_path, out)
         return
     _refuse_without_axis(axis)
     if plot_path is not None:
@@ -189,33 +189,16 @@ def _refuse_without_axis(axis: dict[str, Any]) -> None:
             raise ConfigError(f"--{name.replace('_', '-')}: for the loops of --axis", hint="add --axis")
 
 
-def _stored(path: Path | None, drive_map: DriveMap, source: MachineFile) -> tuple[Any, float | None]:
-    """Return what a backup of the drive holds, by catalogue name, and the limit of its current (A peak)."""
-    if path is None:
-        return None, None
-    from pmsmtool.commissioning.axis_design import own_torque
-    from pmsmtool.flash.journal import read_snapshot
-    from pmsmtool.flash.restore import snapshot_set
-
-    snapshot = read_snapshot(path)
-    if not drive_map.is_for(snapshot.identity.vendor, snapshot.identity.product):
-        raise ConfigError(
-            f"the backup is not of a drive of the map {drive_map.name!r}", where=str(path),
-            hint="`pmsmtool backup --map NAME` of the drive that is tuned makes one",
-        )  # fmt: skip
-    held = snapshot_set(drive_map, snapshot.entries, own_torque(source, drive_map))
-    return held.values, snapshot.current_limit_apk
-
-
 def _axis(
-    source: MachineFile, drive_map: DriveMap, asked: dict[str, Any], axis: dict[str, Any],
+    machine: str, drive_map: DriveMap, asked: dict[str, Any], axis: dict[str, Any],
     path: Path, params_path: Path, out: Output,
 ) -> None:  # fmt: skip
     from pmsmtool.axis.design import AxisRequest
-    from pmsmtool.commissioning.axis_design import axis_parameters, design_axis, not_offered
+    from pmsmtool.commissioning.axis_design import axis_parameters, design_axis, flashed_design, not_offered, stored_in
     from pmsmtool.design.design_file import design_text
     from pmsmtool.design.tune_request import TuneRequest
     from pmsmtool.errors import Partial
+    from pmsmtool.machine.machine_file import load_machine_file
 
     for name in _LIMITS:
         asked.pop(name)
@@ -223,7 +206,9 @@ def _axis(
     if bandwidth_hz is not None:
         asked["bandwidth_hz"] = bandwidth_hz
     request = AxisRequest(axis["axis_phase_margin_deg"], axis["axis_peak_db"], axis["loop_rate_hz"], filter_hz)
-    design = design_axis(source, TuneRequest(**asked), request, drive_map, *_stored(axis["stored"], drive_map, source))
+    source, tuned = load_machine_file(machine), TuneRequest(**asked)
+    held, flashed = stored_in(axis["stored"], drive_map, source), flashed_design(machine, tuned, drive_map)
+    design = design_axis(source, tuned, request, drive_map, *held, flashed)
     params = axis_parameters(design)
     write_file(path, design_text(design))
     write_file(params_path, params.to_toml())

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 
 from pmsmtool.axis.design import (
     AXIS_ROWS,
@@ -23,7 +24,7 @@ from pmsmtool.axis.design import (
     with_axis,
 )
 from pmsmtool.design.closed_drive import RATED, STATED
-from pmsmtool.design.design_file import Design, DesignValue, Scalar
+from pmsmtool.design.design_file import Design, DesignValue, Scalar, load_design
 from pmsmtool.design.loops.open_loops import (
     CURRENT_GAINS,
     CURRENT_LOOPS,
@@ -37,10 +38,13 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.envelope import largest_torque
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap
-from pmsmtool.errors import DesignInfeasible
+from pmsmtool.errors import ConfigError, DesignInfeasible
+from pmsmtool.flash.journal import read_snapshot
+from pmsmtool.flash.restore import snapshot_set
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import TORQUE_PER_AMPERE
 from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.run_directory import RunDirectory
 
 Designed = Callable[[MachineFile, TuneRequest], Design]
 """A rule from machine and request to a design."""
@@ -134,6 +138,36 @@ def own_torque(source: MachineFile, drive_map: DriveMap) -> dict[str, float]:
     return {TORQUE_PER_AMPERE: assumed_torque(source.machine)}
 
 
+def flashed_design(source: str, request: TuneRequest, drive_map: DriveMap) -> Design | None:
+    """Return the design that a run directory wrote to the reference drive; None for others, and where more is asked.
+
+    An axis added to it leaves the rest of the set as the drive holds it, so that `prove` finds that there.
+    """
+    folder = Path(source)
+    if not drive_map.staging or request != TuneRequest() or not (folder / "design.toml").is_file():
+        return None
+    return load_design(folder / "design.toml") if RunDirectory(folder).read().passed("flash") else None
+
+
+def stored_in(
+    backup: Path | None, drive_map: DriveMap, source: MachineFile
+) -> tuple[Mapping[str, float] | None, float | None]:
+    """Return what a backup of a drive holds, by catalogue name, and the limit of its current (A peak).
+
+    Raises ConfigError: it is not of a drive of the map.
+    """
+    if backup is None:
+        return None, None
+    snapshot = read_snapshot(backup)
+    if not drive_map.is_for(snapshot.identity.vendor, snapshot.identity.product):
+        raise ConfigError(
+            f"the backup is not of a drive of the map {drive_map.name!r}", where=str(backup),
+            hint="`pmsmtool backup --map NAME` of the drive that is tuned makes one",
+        )  # fmt: skip
+    held = snapshot_set(drive_map, snapshot.entries, own_torque(source, drive_map))
+    return held.values, snapshot.current_limit_apk
+
+
 def design_axis(
     source: MachineFile,
     request: TuneRequest,
@@ -141,20 +175,26 @@ def design_axis(
     drive_map: DriveMap,
     stored: Mapping[str, float] | None = None,
     limit_apk: float | None = None,
+    flashed: Design | None = None,
 ) -> Design:
     """Design the axis of a machine on a drive; what it holds is kept where that follows better with enough margin.
 
     Raises ConfigError: the machine file has no inertia, or gains do not fit the drive's types; DesignInfeasible: no
     gains keep the margins over the tolerance box.
 
-    ``limit_apk``: the drive's own limit of its current (A peak), where that is known.
+    ``limit_apk``: the drive's own limit of its current (A peak), where that is known. ``flashed``: the design that the
+    drive holds, which keeps all but its axis; its gains are the stored ones where no others are given.
     """
     drive = axis_drive(drive_map)
     if limit_apk is not None:
         drive = replace(drive, torque_nm=largest_torque(source.machine, limit_apk))
-    made = with_axis(tune(source, request), axis, drive)
+    made = with_axis(flashed or tune(source, request), axis, drive)
+    if stored is None and flashed is not None:
+        stored = flashed.parameter_set().values
     if stored is not None:
         made = at_least_as_good(made, stored, drive)
+    elif drive.keeps_gains:
+        made = made.noted({}, "whether the gains in the drive follow better is not known: --stored compares them")
     if drive_map.staging:
         return made.design
     lacking = not_offered(drive_map)

@@ -55,9 +55,9 @@ class ForetoldMove:
 
     def lines(self, error_limit_rad: float) -> list[str]:
         """Return what is said before the move; ``error_limit_rad``: following error at which it is ended."""
-        said = [f"predicted following error: {self}"]
+        said = [f"predicted following error: {self}; a play of the shaft is not in it"]
         if self.error_most_rad > error_limit_rad:
-            said[0] += ", beyond what ends the move: ask for a slower one"
+            said[0] += "; it is beyond what ends the move: ask for a slower one"
         if self.torque_nm > self.torque_limit_nm:
             said.append(
                 f"the loops would ask for {self.torque_nm:.3g} N m, the current limit gives {self.torque_limit_nm:.3g} "

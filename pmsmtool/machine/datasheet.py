@@ -16,7 +16,7 @@ from typing import Literal
 
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.machine.parameters import Estimate, InverterParameters, MachineParameters, implausible
+from pmsmtool.machine.parameters import EncoderParameters, Estimate, InverterParameters, MachineParameters, implausible
 from pmsmtool.machine.simulation_keys import simulation_of
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K
 from pmsmtool.machine.torque import torque_per_ampere
@@ -408,12 +408,15 @@ def machine_from_datasheet(sheet: Datasheet) -> DatasheetResult:
     std["R_winding_ohm"] = std["R_s_ohm"]  # what is measured at the motor's terminals is copper: no bridge, no cable
     simulation, assumed = simulation_of(machine, sheet.encoder_bits)
     steps += [Conversion("[simulation]", "assumed", line, "for a rehearsal alone") for line in assumed]
+    encoder = EncoderParameters(bits=sheet.encoder_bits)
     machine_file = MachineFile(
-        sheet.name, machine, inverter, std=std, estimates=estimates, simulation=simulation
+        sheet.name, machine, inverter, encoder=encoder, std=std, estimates=estimates, simulation=simulation
     )  # fmt: skip
     return DatasheetResult(machine_file, tuple(steps), tuple(warnings))
 
 
+CONVERSION = "conversion"
+"""Method of an estimate that nothing measured here."""
 _QUANTITY = {"R_s_ohm": "R", "L_d_h": "L", "L_q_h": "L", "psi_f_wb": "psi", "J_kgm2": "J"}
 _UNIT = {"R_s_ohm": "ohm", "L_d_h": "H", "L_q_h": "H", "psi_f_wb": "Wb", "J_kgm2": "kg m2"}
 
@@ -422,7 +425,7 @@ def _estimate(sheet: Datasheet, key: str, value: float) -> Estimate:
     source = sheet.source(_QUANTITY[key])
     std = value * TOLERANCE[source][_QUANTITY[key]] / math.sqrt(3.0)
     T_c = T_REF_C if key in ("R_s_ohm", "psi_f_wb") else math.nan
-    return Estimate(value, std, 0.0, _UNIT[key], T_c=T_c, method="conversion", source=source)
+    return Estimate(value, std, 0.0, _UNIT[key], T_c=T_c, method=CONVERSION, source=source)
 
 
 def _resistance(sheet: Datasheet, steps: list[Conversion]) -> float:
@@ -442,6 +445,13 @@ def _inductance(sheet: Datasheet, axis: str, steps: list[Conversion]) -> float:
     return phase
 
 
+OF_BLOCK = (
+    "K_t in N m/A and K_e in V s/rad are the same number: "
+    "both are those of block commutation, 'A block' and 'rpm/V block'"
+)
+"""What a pair of constants is that differs by no factor: with peak or rms amperes it would."""
+
+
 def _flux(sheet: Datasheet, steps: list[Conversion], warnings: list[str]) -> float:
     found: list[float] = []
     if sheet.K_e is not None:
@@ -456,5 +466,7 @@ def _flux(sheet: Datasheet, steps: list[Conversion], warnings: list[str]) -> flo
     if not found:
         raise ConfigError("neither a back-EMF constant nor a torque constant is given", hint="give --ke or --kt")
     if len(found) == 2 and (text := disagreement(found[0], found[1], sheet.pole_pairs)):
-        warnings.append(text)
+        assert sheet.K_e is not None and sheet.K_t is not None
+        same = abs(sheet.K_t.value / sheet.K_e.value - 1.0) <= _SAME_KIND and not sheet.K_e.is_flux
+        warnings.append(f"{text}; {OF_BLOCK}" if same else text)
     return found[0]

@@ -84,6 +84,7 @@ def test_random_machines_of_the_box_keep_what_was_asked(family: str, f_a: float,
     made = designed(family, f_a, f_r)
     hertz = made.loops["current_q"].bandwidth_rad_s / (2.0 * math.pi)
     assert any(f"a q current loop of {hertz:.3g} Hz" in note for note in made.notes)
+    assert not any("notch at" in note for note in made.notes)  # that of the speed loop of `tune`, which is replaced
     drive = axis_drive(load_family(family))
     path, _ = axis_path(made, ASKED, drive, mechanics_of(made.machine))
     notch = Notch(made["speed.notch_hz"], made["speed.notch_zeta_num"], made["speed.notch_zeta_den"])

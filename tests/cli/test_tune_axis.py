@@ -9,7 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from pmsmtool.design.design_file import design_text, load_design
+from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.flash.journal import read_snapshot, write_snapshot
+from pmsmtool.machine.datasheet import CONVERSION
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from tests.cli.conftest import Tool
 
 DRIVE = ("--map", "epos4", "--sim", "interior-2k2?drive=epos4&nv=axis.nv")
@@ -49,6 +56,24 @@ def test_gains_of_the_axis_reach_the_drive(tool: Tool, tmp_path: Path) -> None:
     code, _, said = tool("restore", *DRIVE, "--yes")
     assert code == 0 and "12 of 12 objects change" in said and "-> 0x0003F5A1" in said, said
     assert tool("verify", "axis.params.toml", *DRIVE)[0] == 1
+
+
+@pytest.mark.chain
+def test_an_axis_of_a_run_is_compared_with_what_the_run_flashed(tool: Tool, tmp_path: Path) -> None:
+    """Gains that follow better than those of the axis were in the drive, and nothing said so."""
+    source = load_machine_file("interior-2k2")
+    estimate = Estimate(source.machine.J_kgm2 or 0.0, 1e-5, 0.0, "kg m2", method=CONVERSION)
+    made = tune(replace(source, estimates={"J_kgm2": estimate}), TuneRequest(eps=0.05))
+    run = RunDirectory.create(tmp_path, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
+    run.save("design.toml", design_text(made))
+    run.save("machine.toml", dump_machine_file(made.machine))
+    for status, compared in (("fail", False), ("pass", True)):
+        run.add(Stage("flash", status, 1.0))
+        code, _, said = tool("tune", str(run.path), "-o", "axis.toml", "--axis")
+        assert code == 0 and ("--stored compares them" in said) is not compared
+        assert ("axis_stored_gains" in load_design(Path("axis.toml")).facts) is compared
+        assert (load_design(Path("axis.toml"))["governor.eps"] == 0.05) is compared  # the rest of the set stays
+        assert "as given, not measured: of the motor alone" in said
 
 
 def test_a_drive_without_units_gets_a_table_and_exit_code_10(tool: Tool) -> None:

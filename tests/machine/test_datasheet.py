@@ -138,6 +138,13 @@ def test_a_torque_constant_that_contradicts_is_named(factor, says):
     assert result.machine_file.machine.psi_f_wb == pytest.approx(PSI)  # K_e decides
 
 
+def test_constants_of_block_commutation_that_are_called_rms_are_named():
+    """44 mNm/A and 217 rpm/V of one motor: "one of the two is line-line where phase was said"."""
+    K_t, K_e = parse_torque_constant("44mNm/Arms"), parse_emf_constant("217rpm/Vrms", "line-line")
+    (warning,) = machine_from_datasheet(sheet(K_t=K_t, K_e=K_e)).warnings
+    assert warning.endswith("both are those of block commutation, 'A block' and 'rpm/V block'")
+
+
 @pytest.mark.parametrize(("factor", "kind"), [(1.5, "peak"), (2.1213, "rms"), (1.654, "block")])
 def test_an_ampere_that_is_not_said_is_recognised_by_the_back_emf(factor, kind):
     text = f"{factor * P * PSI * 1.006!r}Nm/A"
@@ -156,7 +163,7 @@ def test_what_a_rehearsal_needs_is_written_and_named(rated, assumed):
     """Without it: `adc_bits needs adc_full_scale_apk`."""
     result = machine_from_datasheet(sheet(I_nom_apk=rated, encoder_bits=12))
     settings = settings_of(result.machine_file)
-    assert settings.whole("encoder_bits") == 12
+    assert settings.whole("encoder_bits") == result.machine_file.encoder.bits == 12  # `check` compares them
     assert [step.given for step in result.conversions if step.key == "[simulation]"] == ["assumed"] * assumed
     if rated is not None:
         assert settings.number("J_kgm2") > 0.0 and settings.number("adc_full_scale_apk") == 1.5 * 2.0 * rated
