@@ -167,11 +167,6 @@ class AxisDrive:
         """Whether its moves are limited in jerk."""
         return self.own_core or PROFILE[3] in self.offers
 
-    @property
-    def keeps_gains(self) -> bool:
-        """Whether a backup says what its loops of speed and position hold."""
-        return self.offers.issuperset(_gain_rows(self))
-
     def feeds(self, name: str) -> bool:
         """Whether a feed-forward acts as designed: it is written, or a person enters the whole axis by hand."""
         return name in self.offers or not self.offers & {CASCADE[0], PID[0]}

@@ -91,7 +91,7 @@ class _AllMissingAtOnce(click.Command):
 @click.option("--u-dc", "U_dc_v", required=True, type=Quantity("voltage"), help="DC-link voltage, e.g. 540V.")
 @click.option("--pwm", "f_s_hz", required=True, type=FREQUENCY, help="Control frequency, e.g. 12kHz.")
 @click.option("--dead-time", "dead_time_s", type=TIME, default="0s", help="Dead time, e.g. 2us.")
-@click.option("--encoder-bits", type=click.IntRange(8, 32), help="Encoder resolution, for a rehearsal, e.g. 12.")
+@click.option("--encoder-bits", type=click.IntRange(8, 32), help="Encoder counts per turn, as bits: 12 for 4096.")
 @click.option("--source", type=_SOURCE, default="datasheet", help="Where the numbers come from; sets the deviations.")
 @click.option("--r-source", type=_SOURCE, help="As --source, for the resistance.", show_default=False)
 @click.option("--l-source", type=_SOURCE, help="As --source, for the inductances.", show_default=False)

@@ -193,7 +193,7 @@ def design_axis(
         stored = flashed.parameter_set().values
     if stored is not None:
         made = at_least_as_good(made, stored, drive)
-    elif drive.keeps_gains:
+    elif drive.offers & {CASCADE[0], PID[0]}:
         made = made.noted({}, "whether the gains in the drive follow better is not known: --stored compares them")
     if drive_map.staging:
         return made.design

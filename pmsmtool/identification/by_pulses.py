@@ -359,10 +359,12 @@ def no_link(U_dc_v: float) -> str:
 def below_voltage(facts: PulseFacts, utilisation: float, psi_f_wb: float) -> str:
     """Return what the flux linkage needs of a run that did not reach the voltage limit."""
     text = f"needs a speed at which the voltage is at its limit, and up to {facts.top_rpm:.0f} rpm it was not"
+    below = ""
     if psi_f_wb > 0.0:
         rpm = RPM_PER_RAD_S * utilisation * facts.U_dc_v / (psi_f_wb * facts.pole_pairs)
         text += f" (by the given flux linkage that is at about {rpm:.0f} rpm with {facts.U_dc_v:.4g} V)"
-    return f"{text}: allow a larger --speed-max, or lower the DC link"
+        below = f" below {facts.U_dc_v * facts.top_rpm / rpm:.2g} V"
+    return f"{text}: allow a larger --speed-max where motor and drive bear it, or lower the DC link{below}"
 
 
 def encoder_estimates(found: EncoderResult, traces: Mapping[str, Trace]) -> dict[str, Estimate]:

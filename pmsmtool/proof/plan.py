@@ -318,8 +318,11 @@ def _unmodelled(design: Design) -> str:
     machine = design.machine
     inertia = machine.estimates.get("J_kgm2")
     told = inertia is not None and inertia.fallback.startswith(PLAY_FALLBACK)
-    if told or hides_play(machine, CERTAIN_ZETA):
+    if told:
         return "the shaft has play, which nothing predicts"
+    if hides_play(machine, CERTAIN_ZETA):
+        zeta = 100.0 * (machine.machine.resonance_zeta or 0.0)
+        return f"the resonance is damped by {zeta:.2g} %: play, or a coupling with very much damping"
     if INERTIA in machine.conditions:
         return "the inertia was to be identified, and could not be"
     noise = machine.conditions.get(TORQUE_NOISE)

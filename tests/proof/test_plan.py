@@ -142,7 +142,7 @@ def test_a_resonance_that_no_coupling_damps_so_is_a_play(zeta: float, left_out: 
     known = {"resonance_hz": 110.0, "antiresonance_hz": 60.0, "resonance_zeta": zeta}
     made = tune(replace(base, machine=replace(base.machine, **known), std={**base.std, "resonance_zeta": 0.01}))
     plan = plan_proof(made, conditions(made))
-    assert ("speed step, field weakening: the shaft has play, which nothing predicts" in plan.left_out) is left_out
+    assert any("the resonance is damped by 16 %: play, or a" in line for line in plan.left_out) is left_out
     assert ("speed_step" in [e.name for e in plan.experiments]) is not left_out
 
 
