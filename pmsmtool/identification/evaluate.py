@@ -92,7 +92,7 @@ class Evaluation:
     ``cogging`` and ``harmonics``. ``means`` are inertia and friction by mean accelerations, by their keys, where no
     model explains the pushes, and ``encoder_errors`` those of the position once and twice per turn (rad);
     ``swing_hz`` is where pushes swing the shaft and no linear response does (Hz), ``unseen_hz`` from where on a shaft
-    that is not rigid may swing unseen.
+    that is not rigid may swing unseen, and ``load_ratio`` of load to motor there (0: unknown).
     ``encoder_noise_rad`` is the standard deviation of a position at rest, without what drifts (mechanical).
     ``warming_k_per_a2s`` is what the winding's sensor rises by (:func:`warming`).
     ``supply_w`` is the power from which on the DC link gives way (W).
@@ -114,6 +114,7 @@ class Evaluation:
     encoder_errors: Mapping[int, float] = field(default_factory=dict)
     swing_hz: float = 0.0
     unseen_hz: float = 0.0
+    load_ratio: float = 0.0
     flux_map: FluxMapResult | None = None
     frequency_response: FrequencyResponse | None = None
     cogging: Cogging | None = None
@@ -341,6 +342,10 @@ def evaluate(
             del refused["mechanics"]
     elif moving.mechanics is not None:
         moving = replace(moving, mechanics=with_play_told(moving.mechanics, response))
+        if response is not None and response.suspected_hz:
+            resonance_hz, antiresonance_hz = response.suspected_hz
+            ratio = (resonance_hz / antiresonance_hz) ** 2 - 1.0
+            moving = replace(moving, unseen_hz=resonance_hz, load_ratio=ratio)
     modulation = None
     if shaft.resistance is not None and shaft.inductance is not None and "speeds" in traces:
         L_h = shaft.inductance.L_d.value, shaft.inductance.L_q.value

@@ -29,7 +29,7 @@ from pmsmtool.identification.wiring import SUPPLY, WRONG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import WARMING
-from pmsmtool.machine.two_masses import INERTIA, REFUSED, SWING, TORQUE_NOISE, UNSEEN
+from pmsmtool.machine.two_masses import INERTIA, LOAD_RATIO, REFUSED, SWING, TORQUE_NOISE, UNSEEN
 from pmsmtool.run_directory import Acceptance, Stage
 from pmsmtool.units import format_estimate
 
@@ -211,6 +211,8 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions[SWING] = evaluation.swing_hz
     if evaluation.unseen_hz:
         conditions[UNSEEN] = evaluation.unseen_hz
+    if evaluation.load_ratio:
+        conditions[LOAD_RATIO] = evaluation.load_ratio
     if "mechanics" in request.measured and "J_kgm2" not in evaluation.estimates():
         conditions[INERTIA] = REFUSED
     errors_rad: dict[int, float] = {}

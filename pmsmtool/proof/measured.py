@@ -114,6 +114,7 @@ def _recorded(
 ) -> Trace:
     pole_pairs = design.machine.machine.pole_pairs
     omega_e = pole_pairs * experiment.base_rad_s
+    likely = "the shaft coasts too long while the bus or this computer is slow, or something brakes or drives it"
     for left in reversed(range(ATTEMPTS)):
         if experiment.base_rad_s or experiment.excitation.point is Injection.SPEED:
             _approach(drive, experiment.base_rad_s, design)
@@ -128,6 +129,7 @@ def _recorded(
             drive.wait(experiment.settle_s)
             if swings:
                 say("the shaft swings about its speed: the record begins where it passes it")
+                likely = "the speed loop swings the shaft: play, or an elastic coupling it is too fast for"
                 _await_passing(drive, omega_e, _turn_s(experiment))
         if experiment.move is not None:
             return _moved(drive, experiment, design)
@@ -140,7 +142,7 @@ def _recorded(
     raise SpeedNotReached(
         f"the speed was not kept: {ATTEMPTS} times {experiment.name} began more than {-100.0 * KEPT[0]:g} % below "
         f"{experiment.base_rad_s / RAD_S_PER_RPM:.4g} rpm, or {100.0 * KEPT[1]:g} % above",
-        likely="the shaft coasts too long while the bus or this computer is slow, or something brakes or drives it",
+        likely=likely,
     )
 
 

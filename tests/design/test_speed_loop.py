@@ -34,7 +34,7 @@ from pmsmtool.design.loops.speed_loop import (
 from pmsmtool.design.tune import tune
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import load_machine_file
-from pmsmtool.machine.two_masses import SWING, UNSEEN, Mechanics
+from pmsmtool.machine.two_masses import LOAD_RATIO, SWING, UNSEEN, Mechanics
 from tests.design.test_current_loop import scaled
 
 R, L_Q, T_S, J, B = 0.137, 2.1e-3, 1.0 / 12e3, 0.05, 0.01
@@ -261,6 +261,9 @@ def test_a_design_says_why_its_speed_loop_is_slow() -> None:
     assert "instead of 13.1 Hz: the shaft has play, and torque pulses swing it at 140 Hz" in said["play"]
     assert "instead of 13.1 Hz: the shaft swings at 60 Hz, where a faster loop hunts" in said["elastic"]
     assert "instead of" not in " ".join(tune(rigid).notes)
+    ratio = tune(replace(rigid, conditions={**rigid.conditions, UNSEEN: 25.8, LOAD_RATIO: 1.0}))
+    gains = [design["speed.K_p_nms_per_rad"] for design in (designs["unseen"], ratio, tune(rigid))]
+    assert 2.0 * gains[0] < gains[1] < 0.9 * gains[2], "a known ratio of the masses costs less"
 
 
 @cache

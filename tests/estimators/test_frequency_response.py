@@ -167,6 +167,7 @@ def test_a_rigid_shaft_has_no_resonance_and_a_disturbance_is_none(seed: int) -> 
     traces = records(2e-3, seed)
     found = estimate(traces)
     assert found.found == {} and found.information_gain < 0.0 and "rigid" in found.reason
+    assert found.suspected_hz == ()
     band = found.frequency_hz < 0.5 * found.highest_hz
     assert np.median(np.abs(found.response[band])) == pytest.approx(1.0 / 2e-3, rel=2e-3)
     assert found.chi2_rigid < 1.5
@@ -230,6 +231,8 @@ def test_the_inertia_holds_a_second_mass_that_is_not_claimed(zeta: float, level_
     shaft, rng = shaft_of(62.0, zeta, 1.0), np.random.default_rng(7)
     found = estimate([record(shaft, rng, level_a, bits=11) for _ in range(RECORDS)])
     assert found.found == {} and found.inertia is not None
+    resonance_hz, antiresonance_hz = found.suspected_hz  # what the speed loop bears
+    assert (resonance_hz / antiresonance_hz) ** 2 - 1.0 == pytest.approx(1.0, rel=0.5)
     whole = shaft.J + shaft.J_load
     assert abs(found.inertia.value - whole) < 2.0 * found.inertia.std < 0.08 * whole
 

@@ -105,6 +105,8 @@ class FrequencyResponse:
         explain more and are not claimed.
     shown_hz : float
         Up to where a small second mass would have shown, where none is found (Hz); 0: nowhere.
+    suspected_hz : tuple of float
+        Resonance and antiresonance (Hz) of a second mass that is shown, but not claimed; else empty.
     """
 
     frequency_hz: Array
@@ -119,6 +121,7 @@ class FrequencyResponse:
     reason: str = ""
     inertia: Estimate | None = None
     shown_hz: float = 0.0
+    suspected_hz: tuple[float, ...] = ()
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the table that is kept as a file."""
@@ -230,7 +233,10 @@ def _judged(
         if one is not None and both is not None and gain > INFORMATION_GAIN:  # not claimed, but no rigid shaft either
             one = replace(both, std=math.hypot(both.std, abs(both.value - one.value) / COVERAGE_FACTOR))
         reason = f"no resonance found up to {highest:.3g} Hz: {against}; {shown}"
-        return FrequencyResponse(*facts, chi2, gain, reason=reason, inertia=one, shown_hz=to_hz), lines, rigid
+        f_r, f_a = estimates["resonance_hz"].value, estimates["antiresonance_hz"].value
+        pair = (f_r, f_a) if gain > INFORMATION_GAIN and two.converged and frequency[0] < f_a < f_r else ()
+        none = FrequencyResponse(*facts, chi2, gain, reason=reason, inertia=one, shown_hz=to_hz, suspected_hz=pair)
+        return none, lines, rigid
     resonance, antiresonance = estimates["resonance_hz"].value, estimates["antiresonance_hz"].value
     reason = f"two masses, J_load/J_motor {(resonance / antiresonance) ** 2 - 1.0:.3g}, over {highest:.3g} Hz"
     return FrequencyResponse(*facts, chi2, gain, estimates, reason, both), lines, rigid
