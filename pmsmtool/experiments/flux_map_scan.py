@@ -71,6 +71,8 @@ FIRST_SHARE = 0.02
 SHARES = (0.25, 0.6, 1.0)
 """Currents of the growing shots that size voltage and band, of the largest."""
 SEARCH_STEPS = 14
+GROWN_LEAST, GROWN_MOST = 1.3, 4.0
+"""Factors on the voltage of a shot that did not reach its band: over the share that it reached, and the largest."""
 OVERSHOOT_ALLOWANCE = 1.3
 """Over the overshoot of the shot before: the plane saturates further out."""
 TURNS_LEAST = 3
@@ -230,8 +232,9 @@ def _shot_that_turns(
             return AxisPulse(u, limit, max(0.0, peak - limit), float(np.median(np.diff(turns))))
         if u >= plan.u_max_v:
             break
-        reached = max(peak / limit, 0.2)
-        u = min(plan.u_max_v, u * (4.0 if reached < 1.0 else 2.0))
+        # what dead time and resistance take leaves the rest to the current: no more than it lacks, or it overshoots
+        reached = peak / limit
+        u = min(plan.u_max_v, u * (min(GROWN_MOST, GROWN_LEAST / reached) if reached < 1.0 else 2.0))
     raise refuse(
         "E_EXCITATION",
         f"{u:.3g} V do not turn the {axis} current at {limit:.3g} A often enough, peak {peak:.3g} A",
