@@ -63,13 +63,8 @@ class InverterCurve:
 
     def error_dq_v(self, i_d_a: Array, i_q_a: Array, theta_e_rad: Array) -> tuple[Array, Array]:
         """Error of the three phases in a frame at ``theta_e_rad`` (V, amplitude-invariant)."""
+        e_alpha, e_beta = stator_frame(self.error_v(phases_of(i_d_a, i_q_a, theta_e_rad)))
         c, s = np.cos(theta_e_rad), np.sin(theta_e_rad)
-        i_alpha, i_beta = c * i_d_a - s * i_q_a, s * i_d_a + c * i_q_a
-        root = math.sqrt(3.0)
-        e_a = self.error_v(i_alpha)
-        e_b = self.error_v(-0.5 * i_alpha + 0.5 * root * i_beta)
-        e_c = self.error_v(-0.5 * i_alpha - 0.5 * root * i_beta)
-        e_alpha, e_beta = (2.0 * e_a - e_b - e_c) / 3.0, (e_b - e_c) / root
         return c * e_alpha + s * e_beta, c * e_beta - s * e_alpha
 
     def along_axis(self, frame_rad: float, axis: str, i_a: Array, other_a: float, bias_a: float) -> tuple[Array, Array]:
@@ -212,7 +207,11 @@ def edge_curve(curve: InverterCurve, modulation: Modulation) -> InverterCurve:
 
 
 def ripple_at_edges(
-    on_s: NDArray[np.float64], off_s: NDArray[np.float64], theta_rad: Array, modulation: Modulation
+    on_s: NDArray[np.float64],
+    off_s: NDArray[np.float64],
+    theta_rad: Array,
+    modulation: Modulation,
+    L_h: tuple[float, float] | Array | None = None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Current of each leg beyond its value at the period's ends, at the leg's own rising and falling edge (A).
 
@@ -224,7 +223,10 @@ def ripple_at_edges(
         Angle of the d axis (rad electrical).
     modulation : Modulation
         Link, inductances and period.
+    L_h : ndarray, shape (2, n), optional
+        Inductances of each period (H), where they change with the current.
     """
+    L_d, L_q = modulation.L_h if L_h is None else L_h
     width = off_s - on_s
     applied = width / modulation.period_s
     angle = theta_rad - LEG_ANGLES[:, None]
@@ -235,7 +237,7 @@ def ripple_at_edges(
         for x in range(3):
             conducted = np.clip(time_s[x] - on_s, 0.0, width)
             flux = modulation.U_dc_v * (conducted - applied * time_s[x])  # all legs alike make no vector
-            i_d, i_q = np.sum(c * flux, axis=0) / modulation.L_h[0], -np.sum(s * flux, axis=0) / modulation.L_h[1]
+            i_d, i_q = np.sum(c * flux, axis=0) / L_d, -np.sum(s * flux, axis=0) / L_q
             found[x] = 2.0 / 3.0 * (c[x] * i_d - s[x] * i_q)
         return found
 
@@ -262,20 +264,51 @@ def rippled_error_dq_v(
     modulation : Modulation
         Link, inductances, period and dead time.
     """
-    U_dc, T_s = modulation.U_dc_v, modulation.period_s
     v, i = phases_of(*voltage, theta_rad), phases_of(*current, theta_rad)
+    on, off = edges_of(edge_curve(curve, modulation), i, np.zeros_like(i), v, theta_rad, modulation)
+    e_alpha, e_beta = edge_error_v(on, off, v, modulation)
+    c, s = np.cos(theta_rad), np.sin(theta_rad)
+    return c * e_alpha + s * e_beta, c * e_beta - s * e_alpha
+
+
+def edges_of(
+    sharp: InverterCurve,
+    i: NDArray[np.float64],
+    change: NDArray[np.float64],
+    v: NDArray[np.float64],
+    theta_rad: Array,
+    modulation: Modulation,
+    L_h: Array | None = None,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return when the legs rise and fall in their periods (s), shape (3, n).
+
+    ``sharp`` is the error over the current at the edge (:func:`edge_curve`); ``i`` the phase currents at the period's
+    start, and ``change`` what they are beyond that at its end (A), ``v`` the phase voltages asked for (V), all (3, n);
+    the others as of :func:`ripple_at_edges`.
+    """
+    U_dc, T_s = modulation.U_dc_v, modulation.period_s
     edge = (1.0 - duties(v, U_dc)) * 0.5 * T_s
-    sharp = edge_curve(curve, modulation)
 
     def late(i_own: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(modulation.dead_time_s - np.maximum(0.0, sharp.error_v(i_own)) * T_s / U_dc)
 
-    rise, fall = late(-i), late(i)
+    on, off = edge + late(-i), T_s - edge + late(i)
     for k in range(ITERATIONS):
         step = STEP / (1.0 + k / SLOWING)
-        at_rise, at_fall = ripple_at_edges(edge + rise, T_s - edge + fall, theta_rad, modulation)
-        rise, fall = rise + step * (late(-i - at_rise) - rise), fall + step * (late(i + at_fall) - fall)
-    e_a, e_b, e_c = (rise - fall) * U_dc / T_s
-    e_alpha, e_beta = (2.0 * e_a - e_b - e_c) / 3.0, (e_b - e_c) / ROOT_3
-    c, s = np.cos(theta_rad), np.sin(theta_rad)
-    return c * e_alpha + s * e_beta, c * e_beta - s * e_alpha
+        at_rise, at_fall = ripple_at_edges(on, off, theta_rad, modulation, L_h)
+        at_rise, at_fall = i + change * on / T_s + at_rise, i + change * off / T_s + at_fall
+        on, off = on + step * (edge + late(-at_rise) - on), off + step * (T_s - edge + late(at_fall) - off)
+    return on, off
+
+
+def edge_error_v(
+    on_s: NDArray[np.float64], off_s: NDArray[np.float64], v: NDArray[np.float64], modulation: Modulation
+) -> NDArray[np.float64]:
+    """Return what the legs lose in the stator frame (V), shape (2, n), by the times of their edges."""
+    U_dc = modulation.U_dc_v
+    return stator_frame(U_dc * (duties(v, U_dc) - (off_s - on_s) / modulation.period_s))
+
+
+def stator_frame(phases: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return alpha and beta, shape (2, n), of three phases; amplitude-invariant, without what all of them share."""
+    return np.stack([(2.0 * phases[0] - phases[1] - phases[2]) / 3.0, (phases[1] - phases[2]) / ROOT_3])

@@ -319,7 +319,7 @@ def evaluate(
     )
     if result.inductance is not None and result.flux is not None:
         result = replace(result, inductance=_beside_speeds(result.inductance, result.flux.L_q_app))
-    flux_map = attempt("map", lambda: flux_map_of(traces, result, tolerance))
+    flux_map = attempt("map", lambda: flux_map_of(traces, result, tolerance, U_dc_v))
     if flux_map is not None:
         result = replace(result, flux_map=flux_map, map_estimates=map_estimates(result, flux_map, traces))
     dead_time_s = 0.0

@@ -34,7 +34,7 @@ DEVIATION_LIMIT = 0.01
 
 
 def flux_map_of(
-    traces: Mapping[str, Trace], result: Evaluation, tolerance: SensorTolerance | None
+    traces: Mapping[str, Trace], result: Evaluation, tolerance: SensorTolerance | None, U_dc_v: float
 ) -> FluxMapResult | None:
     """Return the flux map of the pulse trains; None without them, or where the rotor turned and no flux is known.
 
@@ -67,6 +67,8 @@ def flux_map_of(
         to_reference_wb=to_reference,
         align=held,
         tolerance=tolerance,
+        U_dc_v=U_dc_v,
+        sampling=None if result.inductance is None else result.inductance.sampling,
     )
 
 

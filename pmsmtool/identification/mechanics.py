@@ -22,7 +22,7 @@ from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_
 from pmsmtool.estimators.inverter_error import Modulation
 from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR
 from pmsmtool.estimators.shaft.mechanics import POWERED, MechanicsResult, Torque, estimate_mechanics, mean_mechanics
-from pmsmtool.estimators.shaft.swing import swing_of
+from pmsmtool.identification.swing import swing_of
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
 from pmsmtool.machine.two_masses import SLOWEST_UNSEEN_HZ

@@ -20,8 +20,9 @@ from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.least_squares import Fit
 from pmsmtool.estimators.shaft import frequency_response as fr
-from pmsmtool.estimators.shaft import mechanics, response_lines, swing
+from pmsmtool.estimators.shaft import mechanics, response_lines
 from pmsmtool.estimators.shaft.model import Run
+from pmsmtool.identification import swing
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace

@@ -25,10 +25,11 @@ from pmsmtool.estimators.injection.sampling_instant import CoastingPairs, shown_
 from pmsmtool.estimators.inverter_error import InverterCurve, Modulation, edge_curve
 from pmsmtool.estimators.least_squares import Fit
 from pmsmtool.estimators.shaft import frequency_response as fr
-from pmsmtool.estimators.shaft import inertia_ratio, mechanics, swing
+from pmsmtool.estimators.shaft import inertia_ratio, mechanics
 from pmsmtool.estimators.shaft.inertia_ratio import FRICTION_FLOOR, MODEL_FLOOR, RATIO_LIMIT, SATURATED_SHARE, SURELY
 from pmsmtool.estimators.shaft.model import Run
 from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, local_polynomials
+from pmsmtool.identification import swing
 from pmsmtool.trace import Trace
 from tests.estimators.traces import trace_of
 

@@ -18,9 +18,9 @@ from pmsmtool.estimators.flux.map_rows import (
     correlation,
     mean_error,
     normal_equations,
-    ramp,
     turn,
 )
+from pmsmtool.estimators.inverter_error import InverterCurve
 
 KNEE_A = 0.5
 ROUNDING, SHARP = 1e-12, 0.05
@@ -37,7 +37,7 @@ ROUNDING, SHARP = 1e-12, 0.05
 def test_an_error_is_the_mean_over_the_interval(
     begin: tuple[float, float], end: tuple[float, float], tolerance: float
 ) -> None:
-    curve = ramp(KNEE_A)
+    curve = InverterCurve(np.array([KNEE_A, 2.0 * KNEE_A]), np.ones(2), 0.0)
     way = np.linspace(0.0, 1.0, 20_001)[:, None]
     path = (1.0 - way) * np.array(begin) + way * np.array(end)
     expected = np.mean(np.stack(curve.error_dq_v(path[:, 0], path[:, 1], np.zeros(len(path)))), axis=1)
@@ -82,7 +82,7 @@ def _pulses(offset_v: tuple[float, float], iron_s: tuple[float, ...]) -> PulseIn
         eddy += share * np.mean(1.0 / L_H) * turn(-theta, faded)
     seconds = T_S * k * np.array(offset_v)[:, None]
     none = np.zeros_like(psi)
-    return PulseIntegrals(psi / L_H[:, None] + eddy, theta, flux_s + seconds, none, 4 * (none,), acting, 2)
+    return PulseIntegrals(psi / L_H[:, None] + eddy, theta, flux_s + seconds, none, none, acting, 2)
 
 
 def test_a_voltage_that_is_off_leaves_no_flux() -> None:
@@ -119,7 +119,7 @@ def test_residuals_that_hang_together_count_as_fewer() -> None:
 def _with_flux(pulses: PulseIntegrals, flux: Array) -> PulseIntegrals:
     """Pulses whose integral of the voltage is a flux of the rotor frame."""
     none = np.zeros_like(flux)
-    return PulseIntegrals(none, pulses.theta, turn(pulses.theta, flux), none, 4 * (none,), none, 2)
+    return PulseIntegrals(none, pulses.theta, turn(pulses.theta, flux), none, none, none, 2)
 
 
 def test_what_the_angles_of_the_pulses_leave_of_the_inductance() -> None:
@@ -127,7 +127,7 @@ def test_what_the_angles_of_the_pulses_leave_of_the_inductance() -> None:
 
     def at(*angles: float) -> float:
         none = np.zeros((2, len(angles)))
-        return map_fit._unseen([PulseIntegrals(none, np.array(angles), none, none, (), none, 0)])
+        return map_fit._unseen([PulseIntegrals(none, np.array(angles), none, none, none, none, 0)])
 
     assert at(0.3) == pytest.approx(math.hypot(0.01, 0.02), rel=1e-9)
     assert at(*np.linspace(0.0, 2.0 * math.pi, 25)[:-1]) == pytest.approx(0.0, abs=1e-12)

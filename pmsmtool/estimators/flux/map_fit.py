@@ -9,7 +9,7 @@ current residuals of the measured noise. Symmetry in i_q and reciprocity are tes
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,9 +18,9 @@ from pmsmtool.arrays import Array
 from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
 from pmsmtool.estimators.flux.map_rows import (
     IRON_PERIODS,
-    KNEES,
     NUISANCES,
     Frame,
+    Legs,
     NormalEquations,
     PulseIntegrals,
     Whitener,
@@ -29,7 +29,8 @@ from pmsmtool.estimators.flux.map_rows import (
     normal_equations,
 )
 from pmsmtool.estimators.injection.angle_dependence import HARMONICS
-from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.injection.sampling_instant import Sampling
+from pmsmtool.estimators.inverter_error import InverterCurve, Modulation
 from pmsmtool.trace import Trace
 
 PIECES = (15, 17)
@@ -57,10 +58,8 @@ R_STD = 0.01
 """Relative standard deviation of R in the fit: it follows the winding's temperature."""
 INVERTER_STD = 0.1
 """Standard deviation of the factor on the measured inverter curve."""
-RAMP_STD = 0.3
-"""Standard deviation of each further shape of the error, of the measured plateau."""
-DELAY_STD_SHARE = 0.1
-"""Standard deviation of the delay of the current sample, of the control period."""
+DELAY_STD_SHARE, DELAY_LEFT_SHARE = 0.1, 0.01
+"""Standard deviation of the delay of the current sample, of the control period; and where it is known, of its rest."""
 IRON_STD_SHARE = 0.5
 """Standard deviation of what flows in each branch of iron loss, per volt and by the mean inductance, likewise."""
 ANCHOR = 1e4
@@ -230,6 +229,7 @@ def fit_coenergy(
     sigma_a: float,
     magnet: MagnetFlux,
     align: bool = False,
+    legs: tuple[Modulation, Sampling | None] | None = None,
 ) -> CoenergyFit:
     """Fit the co-energy.
 
@@ -249,14 +249,14 @@ def fit_coenergy(
         Flux at zero current; a held rotor shows increments only.
     align : bool
         Turn the frame onto the axis of symmetry: where the offset of the encoder is not known better.
+    legs : (Modulation, Sampling or None), optional
+        Link, period and dead time (its inductances are not read), and when currents are sampled where that is known:
+        with them the fine pass knows what the current does within a period.
     """
     T_s = float(traces[0].meta["control_period_s"])
-    plateau = float(np.max(np.abs(curve.u_error_v)))
-    ramps, iron = [RAMP_STD * plateau + 1e-9] * len(KNEES), [IRON_STD_SHARE * T_s] * len(IRON_PERIODS)
-    priors = Priors(
-        (R_ohm, 1.0, *([0.0] * (len(NUISANCES) - 2))),
-        (R_STD * R_ohm, INVERTER_STD, *ramps, *iron, DELAY_STD_SHARE * T_s),
-    )
+    iron = [IRON_STD_SHARE * T_s] * len(IRON_PERIODS)
+    mean = (R_ohm, 1.0, *([0.0] * (len(NUISANCES) - 2)))
+    priors = Priors(mean, (R_STD * R_ohm, INVERTER_STD, *iron, DELAY_STD_SHARE * T_s))
     for _ in range(ALIGNMENTS if align else 1):
         pulses = [integrate_pulses(trace, frame, curve, R_ohm) for trace in traces]
         i = np.concatenate([p.i for p in pulses], axis=1)
@@ -266,6 +266,15 @@ def fit_coenergy(
         whiten = _by_inductance(coarse, x[: coarse.size], i)
         if align:
             frame = replace(frame, offset_rad=frame.offset_rad - _symmetry(coarse, x, covariance, i)[2])
+    if legs is not None:
+        modulation, sampling = legs
+        inductances = _inductances(coarse, x[: coarse.size], i)
+        typical = np.median(inductances(i[:, ::8]), axis=1)
+        known = replace(modulation, L_h=(float(typical[0]), float(typical[1])))
+        within = Legs(known, sampling or Sampling(), inductances)
+        pulses = [integrate_pulses(trace, frame, curve, R_ohm, within) for trace in traces]
+        if sampling is not None:
+            priors = replace(priors, std=(*priors.std[:-1], DELAY_LEFT_SHARE * T_s))
     return _fine_fit(pulses, i, frame, whiten, priors, sigma_a, magnet)
 
 
@@ -317,16 +326,20 @@ def _flat(pulses: Sequence[PulseIntegrals]) -> Whitener:
     return lambda i: np.broadcast_to(np.eye(2) * (current / swing), (i.shape[1], 2, 2))
 
 
+def _inductances(spline: CoenergySpline, c: Array, i: Array) -> Callable[[Array], Array]:
+    """Return L_dd and L_qq (H) over the currents of a first pass, none far below the median."""
+    least = INDUCTANCE_FLOOR * np.median(spline.inductance(c, i[0][::8], i[1][::8]), axis=1)[[0, 2]]
+    return lambda at: np.maximum(spline.inductance(c, at[0], at[1])[[0, 2]], least[:, None])
+
+
 def _by_inductance(spline: CoenergySpline, c: Array, i: Array) -> Whitener:
     """Return L^-1: the noise of psi(i + n) is L n, so these rows have the noise of the current."""
-    median = np.median(spline.inductance(c, i[0][::8], i[1][::8]), axis=1)
+    inductances = _inductances(spline, c, i)
 
     def whiten(at: Array) -> Array:
-        L_dd, L_dq, L_qq = spline.inductance(c, at[0], at[1])
-        L_dd = np.maximum(L_dd, INDUCTANCE_FLOOR * median[0])
-        L_qq = np.maximum(L_qq, INDUCTANCE_FLOOR * median[2])
+        L_dd, L_qq = inductances(at)
         most = COUPLING_MOST * np.sqrt(L_dd * L_qq)
-        L_dq = np.clip(L_dq, -most, most)
+        L_dq = np.clip(spline.inductance(c, at[0], at[1])[1], -most, most)
         det = L_dd * L_qq - L_dq**2
         return np.moveaxis(np.array([[L_qq, -L_dq], [-L_dq, L_dd]]) / det, 2, 0)
 

@@ -17,6 +17,8 @@ from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.map_fit import CoenergyFit, MagnetFlux, fit_coenergy
 from pmsmtool.estimators.flux.map_rows import Frame
+from pmsmtool.estimators.injection.sampling_instant import Sampling
+from pmsmtool.estimators.inverter_error import Modulation
 from pmsmtool.estimators.resistance import ResistanceResult, resistance_warmed
 from pmsmtool.machine.flux_map import FluxMap, require_monotonic
 from pmsmtool.machine.flux_map_check import reciprocal_change
@@ -159,6 +161,8 @@ def estimate_flux_map(
     to_reference_wb: float = 0.0,
     align: bool = False,
     tolerance: SensorTolerance | None = None,
+    U_dc_v: float = math.inf,
+    sampling: Sampling | None = None,
 ) -> FluxMapResult:
     """Estimate the flux map from pulse traces.
 
@@ -183,11 +187,19 @@ def estimate_flux_map(
         Take the axis of symmetry as d axis: a held rotor, whose offset no speed run has measured.
     tolerance : SensorTolerance
         Declared sensor tolerances.
+    U_dc_v : float
+        DC link (V); infinite where it is not known: the ripple within a period is then none.
+    sampling : Sampling, optional
+        When and how the currents are sampled, where that is known.
     """
     tolerance = tolerance or SensorTolerance()
     traces, left_out = _whole_pulses(traces)
-    R_ohm = _R_at(resistance, traces)
-    fit = fit_coenergy(traces, frame, resistance.curve, R_ohm=R_ohm, sigma_a=noise.sigma_a, magnet=magnet, align=align)
+    R_ohm, T_s = _R_at(resistance, traces), float(traces[0].meta["control_period_s"])
+    fit = fit_coenergy(
+        traces, frame, resistance.curve, R_ohm=R_ohm, sigma_a=noise.sigma_a, magnet=magnet, align=align,
+        legs=(Modulation(U_dc_v, (math.nan, math.nan), T_s, max(0.0, resistance.V_dead_v) * T_s / U_dc_v), sampling)
+        if math.isfinite(U_dc_v) else None,
+    )  # fmt: skip
     i_max = max(float(trace.meta["i_max_a"]) for trace in traces)
     axis_d, axis_q = _axis(fit.spline.breaks_d, i_max), _axis(fit.spline.breaks_q, i_max)
     i_d, i_q = (grid.ravel() for grid in np.meshgrid(axis_d, axis_q, indexing="ij"))

@@ -18,7 +18,16 @@ import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.flux.coenergy_spline import CoenergySpline
-from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.injection.sampling_instant import Sampling, sampled_flux
+from pmsmtool.estimators.inverter_error import (
+    InverterCurve,
+    Modulation,
+    edge_curve,
+    edge_error_v,
+    edges_of,
+    phases_of,
+    stator_frame,
+)
 from pmsmtool.trace import Trace
 
 SEGMENT = 150
@@ -32,14 +41,9 @@ STEPS_LEFT = 0.6
 """Largest rms between measured and smooth angle, in steps of the encoder; steps alone leave 0.29."""
 ROUNDING = 1e-6
 """Of an angle recorded in binary32, as a second difference of the electrical angle."""
-KNEES = (0.5, 1.0, 2.0)
-"""Further shapes of the inverter's error, a ramp to a plateau each: knees in steps of the current between two samples.
-A fast current, with the ripple of a high duty ratio, rounds the curve that was measured at rest."""
 IRON_PERIODS = (0.0, 2.0)
 """Time constants of branches of iron loss (control periods): what flows in them is in the current and makes no flux."""
-NUISANCES = (
-    "R_ohm", "inverter", *(f"ramp_{knee:g}_v" for knee in KNEES), *(f"iron_{n:g}_s" for n in IRON_PERIODS), "delay_s"
-)  # fmt: skip
+NUISANCES = ("R_ohm", "inverter", *(f"iron_{n:g}_s" for n in IRON_PERIODS), "delay_s")
 """Columns behind the spline coefficients."""
 
 
@@ -63,6 +67,18 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Legs:
+    """What flows within a period: edges see another current than the samples, and these are late by ``sampling``.
+
+    ``inductances`` makes of currents (2, n) L_d and L_q there (H), shape (2, n); those of ``modulation`` are typical.
+    """
+
+    modulation: Modulation
+    sampling: Sampling
+    inductances: Callable[[Array], Array]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class PulseIntegrals:
     """One trace as integrals; arrays of shape (2, n) unless stated.
 
@@ -72,10 +88,8 @@ class PulseIntegrals:
         Currents in the rotor frame (A).
     theta : ndarray, shape (n,)
         Electrical angle of the d axis (rad).
-    volt_seconds, current_seconds : ndarray
-        Integrals of voltage and current up to each sample, stator frame (V s, A s).
-    error_seconds : tuple of ndarray
-        Integrals of the inverter's measured error and of one volt of each further shape, stator frame (V s).
+    volt_seconds, current_seconds, error_seconds : ndarray
+        Integrals of voltage, current and the inverter's measured error up to each sample, stator frame (V s, A s).
     volts_before : ndarray
         Voltage of the interval before each sample, stator frame (V).
     first : int
@@ -86,12 +100,14 @@ class PulseIntegrals:
     theta: Array
     volt_seconds: Array
     current_seconds: Array
-    error_seconds: tuple[Array, ...]
+    error_seconds: Array
     volts_before: Array
     first: int
 
 
-def integrate_pulses(trace: Trace, frame: Frame, curve: InverterCurve, R_ohm: float) -> PulseIntegrals:
+def integrate_pulses(
+    trace: Trace, frame: Frame, curve: InverterCurve, R_ohm: float, legs: Legs | None = None
+) -> PulseIntegrals:
     """Return the integrals of a trace.
 
     Parameters
@@ -104,6 +120,8 @@ def integrate_pulses(trace: Trace, frame: Frame, curve: InverterCurve, R_ohm: fl
         Voltage error of one phase.
     R_ohm : float
         Loop resistance, for the torque that smooths the angle (ohm).
+    legs : Legs, optional
+        None: the error of a current that runs evenly from sample to sample.
     """
     lag = int(trace.meta.get("voltage_lag", 1))
     T_s = float(trace.meta["control_period_s"])
@@ -117,12 +135,13 @@ def integrate_pulses(trace: Trace, frame: Frame, curve: InverterCurve, R_ohm: fl
     before = np.zeros_like(u_s)
     before[:, 1:] = acting
     mean_current = 0.5 * (i_s[:, :-1] + i_s[:, 1:])
-    step = float(np.median(np.max(np.abs(np.diff(i_s)), axis=0)))
-    shapes = (curve, *(ramp(knee * step) for knee in KNEES))
-    error_seconds = tuple(_cumulated(T_s * mean_error(shape, i_s)) for shape in shapes)
+    error_seconds = _cumulated(T_s * mean_error(curve, i_s))
     volt_seconds, current_seconds = _cumulated(T_s * acting), _cumulated(T_s * mean_current)
-    flux = volt_seconds - R_ohm * current_seconds - error_seconds[0]
+    flux = volt_seconds - R_ohm * current_seconds - error_seconds
     theta = smooth_angle(turned, i_s, flux, T_s) + frame.drive_offset_rad - frame.offset_rad
+    if legs is not None:
+        error, beyond = _within_periods(curve, i_s, acting, theta, legs)
+        error_seconds, volt_seconds = _cumulated(T_s * error), volt_seconds + beyond
     return PulseIntegrals(
         i=turn(-theta, i_s),
         theta=theta,
@@ -134,9 +153,21 @@ def integrate_pulses(trace: Trace, frame: Frame, curve: InverterCurve, R_ohm: fl
     )
 
 
-def ramp(knee_a: float) -> InverterCurve:
-    """Return an error curve that rises to one volt at a current and stays there."""
-    return InverterCurve(np.array([knee_a, 2.0 * knee_a]), np.ones(2), 0.0)
+def _within_periods(curve: InverterCurve, i_s: Array, acting: Array, theta: Array, legs: Legs) -> tuple[Array, Array]:
+    """Return the error of each period (V), and by what each sample is beyond its period's end (V s); stator frame.
+
+    What a sample holds beyond that end is known by the edges, which the current at that end moves: two rounds.
+    """
+    v, sharp = phases_of(acting[0], acting[1], np.zeros(1)), edge_curve(curve, legs.modulation)
+    i = turn(-theta, i_s)
+    L, L_mean = legs.inductances(i), legs.inductances(0.5 * (i[:, :-1] + i[:, 1:]))
+    middle, beyond = 0.5 * (theta[:-1] + theta[1:]), np.zeros_like(i_s)
+    for _ in range(2):
+        at_end = i_s - turn(theta, turn(-theta, beyond) / L)
+        phases = phases_of(at_end[0], at_end[1], np.zeros(1))
+        edges = edges_of(sharp, phases[:, :-1], np.diff(phases), v, middle, legs.modulation, L_mean)
+        beyond[:, 1:] = stator_frame(sampled_flux(*edges, legs.modulation, legs.sampling))
+    return edge_error_v(*edges, v, legs.modulation), beyond
 
 
 def mean_error(curve: InverterCurve, i: Array) -> Array:
@@ -220,11 +251,6 @@ class NormalEquations:
     c: float = 0.0
     n: int = 0
 
-    @classmethod
-    def empty(cls, size: int) -> NormalEquations:
-        """Return sums of nothing."""
-        return cls(np.zeros((size, size)), np.zeros(size))
-
     def add(self, rows: Array, target: Array) -> None:
         """Add rows (n, k) with their targets (n,)."""
         self.A += rows.T @ rows
@@ -257,7 +283,7 @@ def normal_equations(
         A coarse space of flux that has no co-energy, put on psi_d behind all other columns: the test of reciprocity.
     """
     size = spline.size + len(NUISANCES) + (0 if skew is None else skew.size)
-    sums = NormalEquations.empty(size)
+    sums = NormalEquations(np.zeros((size, size)), np.zeros(size))
     for rows, target in _segments(traces, spline, whiten, skew):
         sums.add(rows, target)
         sums.n += len(target) - CONSTANTS
@@ -306,7 +332,7 @@ def _rows(
     parts = [
         np.stack([spline.derivative(i_d, i_q, 1, 0), spline.derivative(i_d, i_q, 0, 1)], axis=1),
         seen(trace.current_seconds)[:, :, None],
-        *(seen(error)[:, :, None] for error in trace.error_seconds),
+        seen(trace.error_seconds)[:, :, None],
         _iron_columns(trace, w),
         seen(trace.volts_before)[:, :, None],
     ]

@@ -96,6 +96,20 @@ def sampled_ripple(
     return np.asarray(np.stack([d, q]).reshape(2, n, ANGLES).mean(axis=2))
 
 
+def sampled_flux(
+    on_s: NDArray[np.float64], off_s: NDArray[np.float64], modulation: Modulation, sampling: Sampling
+) -> NDArray[np.float64]:
+    """Return the volt-seconds of each leg that a sample after its period holds beyond that period's (V s), (3, n).
+
+    By the times of the edges in the period (s), (3, n); those of the next one count as the same.
+    """
+    t, width = sampling.instant_s % modulation.period_s, off_s - on_s
+    beyond = np.clip(t - on_s, 0.0, width) - (width if sampling.instant_s < 0.0 else 0.0)
+    if sampling.lag_s > 0.0:
+        beyond = beyond - sampling.lag_s * _lagging(on_s, off_s, t, sampling.lag_s, modulation.period_s)
+    return np.asarray(modulation.U_dc_v * beyond)
+
+
 def _lagging(on: NDArray[np.float64], off: NDArray[np.float64], t: float, lag_s: float, T_s: float) -> Array:
     """Periodic pulses of height 1 behind a first-order lag, at a time within the period."""
     ended = np.maximum(0.0, t + T_s - off)  # a pulse that fills the period ends late by the dead time

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pmsmtool.estimators.shaft.swing import FREQUENCIES, swing_of
+from pmsmtool.identification.swing import FREQUENCIES, swing_of
 from pmsmtool.trace import Trace
 
 ROWS, T_S = 122, 3e-4
