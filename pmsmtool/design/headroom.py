@@ -90,7 +90,9 @@ def operating_cells(source: MachineFile, rated: Ratings, voltage_margin: float) 
         jacobian = np.tile([[machine.L_d], [0.0], [0.0], [machine.L_q]], i_d.size)
     else:
         jacobian = source.flux_map.incremental_inductance(i_d, i_q).reshape(4, -1)
-    achieved = table.achieved_torque_nm[..., 0][known]
+    # of no torque a solution leaves 1e-21 N m, whose sign turns with the inductances: it would count as out of reach
+    asked = np.broadcast_to(table.torque_nm[:, None], known.shape)[known]
+    achieved = np.where(asked == 0.0, 0.0, table.achieved_torque_nm[..., 0][known])
     omega = electrical_speed(machine, speed)
     return OperatingCells(achieved, speed, omega, i_d, i_q, psi_d, psi_q, jacobian, lost)
 

@@ -6,12 +6,16 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from pmsmtool.design import headroom
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop
 from pmsmtool.design.loops.margins import MarginRequest, margin_problem
 from pmsmtool.design.loops.sampled_loop import margins
+from pmsmtool.design.ratings import ratings
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, TORQUE_SHORTFALL, interval_needs
@@ -102,3 +106,19 @@ def test_the_speed_loop_bears_a_wide_interval_of_the_inertia(name: str) -> None:
         phase = needs["speed phase margin"]
         assert phase.ok is good and (phase.worst > INERTIA_LEAVES_DEG) is good
         assert needs["torque within the current limit"].ok, "no limit of voltage or current depends on the inertia"
+
+
+def test_a_point_without_torque_is_not_out_of_reach(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a solution leaves of no torque has a sign, and an interval may turn it; measured 0 % before."""
+    solved = headroom.speed_table
+
+    def leaving(*arguments: Any, **named: Any) -> Any:
+        table = solved(*arguments, **named)
+        none = table.torque_nm[:, None, None] == 0.0
+        return replace(table, achieved_torque_nm=np.where(none, -3.6e-21, table.achieved_torque_nm))
+
+    monkeypatch.setattr(headroom, "speed_table", leaving)
+    source = profile("interior-2k2")
+    rated = ratings(source, 0.92 * source.inverter.V_max_v)
+    torque = headroom.operating_cells(source, rated, 0.08).torque_nm
+    assert np.sum(torque == 0.0) > 1 and np.min(np.abs(torque[torque != 0.0])) > 1e-3
