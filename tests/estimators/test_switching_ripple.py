@@ -25,8 +25,8 @@ STEPS = 20000
 CLAMPED = 0.4
 """Of the ripple's share; measured 0.31, 0.31 and 0.08: a current that stays at zero for the rest of the dead time, as
 it does without any capacitance, is not in the model."""
-FAST = 0.25
-"""Of the error that a straight course of the current makes; measured 0.16 of 3.8 V where it passes zero."""
+FAST = 0.05
+"""Of the error that a straight course of the current makes; measured 0.15 of 4.9 to 8.7 V."""
 
 
 def nominal_edges(v: np.ndarray, m: Modulation) -> np.ndarray:
@@ -107,8 +107,7 @@ def test_the_error_is_that_of_switches_and_diodes(i_d: float) -> None:
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize("start", [(-9.0, 2.0), (-2.0, -1.6), (-1.5, 1.0)])
-@pytest.mark.parametrize("instant_s", [4e-6, -4e-6])
+@pytest.mark.parametrize(("start", "instant_s"), [((-3.0, 0.5), 4e-6), ((-2.0, -0.5), -4e-6), ((-0.5, -0.5), 4e-6)])
 def test_a_current_that_changes_fast_passes_zero_between_samples(start: tuple[float, float], instant_s: float) -> None:
     """A pulse on a machine at rest: the error of its period, and the sample behind it, by switches and diodes."""
     m = Modulation(U_dc_v=300.0, L_h=(2e-3, 2e-3), period_s=1e-4, dead_time_s=2.5e-6)
@@ -120,10 +119,8 @@ def test_a_current_that_changes_fast_passes_zero_between_samples(start: tuple[fl
     i, seen, legs = [i_0], [i_0], []
     for k in range(steps + max(0, late)):
         t = (k % steps + 0.5) * dt
-        upper, lower = (
-            (t > on + m.dead_time_s) & (t < m.period_s - on),
-            (t < on) | (t > m.period_s - on + m.dead_time_s),
-        )
+        upper = (t > on + m.dead_time_s) & (t < m.period_s - on)
+        lower = (t < on) | (t > m.period_s - on + m.dead_time_s)
         legs.append(m.U_dc_v * np.where(upper | lower, upper, phases_of(*i[k], theta) < 0.0))
         i.append(i[k] + dt / m.L_h[0] * stator_frame(legs[k]))
         seen.append(seen[k] + dt / sampling.lag_s * (i[k] - seen[k]))
@@ -132,7 +129,7 @@ def test_a_current_that_changes_fast_passes_zero_between_samples(start: tuple[fl
     curve = edge_curve(InverterCurve(np.array([0.02, 10.0]), np.full(2, m.plateau_v), 0.0), m)
     edges = edges_of(curve, phases_of(*i_0, theta), phases_of(*(at_end - i_0), theta), v, theta, m)
     plain = np.stack(curve.error_dq_v(*(0.5 * (i_0 + at_end)), theta))
-    assert np.linalg.norm(edge_error_v(*edges, v, m) - true) < max(FAST * np.linalg.norm(plain - true), 0.1)
+    assert np.linalg.norm(edge_error_v(*edges, v, m) - true) < FAST * np.linalg.norm(plain - true)
     beyond = stator_frame(sampled_flux(*edges, m, sampling)) / m.L_h[0]
     assert beyond == pytest.approx(sample - at_end, abs=0.02 * np.linalg.norm(sample - at_end))  # measured 0.011
 
