@@ -40,6 +40,8 @@ STEPS = (0.5, 0.0, -0.5, 0.0, 1.0, 0.0, -1.0, 0.0)
 """Current steps of one pattern, over the larger one: two sizes and both signs."""
 SETTLE = 8.0
 """A current level lasts this many time constants 1/alpha of its loop."""
+BANDWIDTH_ROUNDING = 1e-3
+"""Of them a rounding is no row more: the modulus optimum 1/(3 T_s) makes them 24 rows to the last bit of K_p and L."""
 LEVEL_ROWS = (24, 64)
 """Least and most rows of a level."""
 PATTERN_ROWS = 1536
@@ -381,7 +383,7 @@ def _current_steps(s: _Sizes, axis: str) -> Experiment:
     emf = s.omega_steps * s.psi
     room = s.V_linear - emf if axis == "q" else math.sqrt(max(s.V_linear**2 - emf**2, 0.0))
     K_p = s.design[f"current.K_p_{axis}_v_per_a"]
-    periods = SETTLE / (s.alpha[axis] * s.T_s)
+    periods = (1.0 - BANDWIDTH_ROUNDING) * SETTLE / (s.alpha[axis] * s.T_s)
     decimation = max(1, math.ceil(periods / LEVEL_ROWS[1]))
     level = min(LEVEL_ROWS[1], max(LEVEL_ROWS[0], math.ceil(periods / decimation)))
     # the shaft runs up while a level lasts: a light one takes voltage with it, and speed

@@ -58,6 +58,15 @@ def changed(made: Design, **values: float) -> Design:
     return replace(made, values={**made.values, **{n: DesignValue(v, "test") for n, v in names.items()}})
 
 
+@pytest.mark.parametrize("ppm", [-100, 100])
+def test_the_last_digits_of_a_gain_do_not_choose_the_record(ppm: int) -> None:
+    made = design()
+    machine, alpha = made.machine.machine, (1.0 + 1e-6 * ppm) / (3.0 * made.machine.inverter.T_s)
+    gains = {"current__K_p_d_v_per_a": alpha * machine.L_d_h, "current__K_p_q_v_per_a": alpha * machine.L_q_h}
+    plan = plan_proof(changed(made, **gains), conditions(made))
+    assert [e.repeats for e in plan.experiments if e.name in ("d_steps", "q_steps")] == [8, 8]
+
+
 def shown(made: Design, response: str) -> Design:
     """The design of a machine whose frequency response showed that of its shaft."""
     known = {**made.machine.conditions, SHOWN: response}

@@ -34,7 +34,6 @@ from pmsmtool.sim.foreign.position import PositionLoop
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.node.node import VENDOR
-from pmsmtool.sim.node.objects import ObjectRow
 
 if TYPE_CHECKING:
     from pmsmtool.bus.clock import Schedule
@@ -104,9 +103,10 @@ class ForeignDrive:
         blank = [] if all(stated) else [f"0x1018 blank in the file: taken as {self.vendor_product}"]
         reaction = [] if objects.has((0x6007, 0)) else ["no 0x6007: a lost master is a fault (0x605E), voltage off"]
         unheld = [
-            f"0x{law.index:04X}:{law.sub:02X} cannot hold this motor's {law.set_up:.0f}"
+            f"0x{law.index:04X}:{law.sub:02X} holds {low:.0f} to {high:.0f}, this motor needs {law.set_up:.0f}"
             for law in self.laws.values()
-            if law.set_up is not None and not _holds(objects.rows[law.index, law.sub], law.set_up)
+            for low, high in [objects.rows[law.index, law.sub].bounds]
+            if law.set_up is not None and not low <= law.set_up <= high
         ]
         if not _holds_encoder(objects, set_up):
             counted = f"{encoder_resolution(objects, set_up.counts):.0f} / {max(1, objects.stored(0x608F, 2))}"
@@ -252,11 +252,6 @@ def _within(objects: MakersObjects, set_up: SetUp) -> SetUp:
     ]
     share = min([1.0, *shares])
     return replace(set_up, i_nom_apk=share * set_up.i_nom_apk, torque_nm=share * set_up.torque_nm)
-
-
-def _holds(row: ObjectRow, value: float) -> bool:
-    low, high = row.bounds
-    return low <= value <= high
 
 
 def _pass_on(dictionary: Dictionary, shown: Entry, inner: Entry) -> None:
