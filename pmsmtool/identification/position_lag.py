@@ -27,8 +27,9 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.identification.learned_gains import NORMAL_95, NOT_SAME, WIDEST, Learned
 from pmsmtool.trace import Trace
 
-EVEN = 0.05
-"""Change of the demanded speed within which a move is even, of its largest."""
+EVEN, EVEN_OVER_S = 0.05, 0.1
+"""Change of the demanded speed within which a move is even, of its largest; time over which that is taken (s): a bus
+tells the instants of samples to some 0.3 ms, which over 20 ms was 5 % of the speed."""
 WINDOW_S = 0.02
 """Over which speeds are taken: counts of the position are no speed from one sample to the next."""
 LEAST_S = 0.4
@@ -126,7 +127,8 @@ def fed_share(trace: Trace, without: PositionLag) -> tuple[float, float]:
 
 def _even_parts(t: Array, demand: Array) -> Iterator[tuple[int, int]]:
     """Yield first and last sample of every part in which the demand moves evenly at its largest speed."""
-    speed = np.abs(np.interp(t + 0.5 * WINDOW_S, t, demand) - np.interp(t - 0.5 * WINDOW_S, t, demand)) / WINDOW_S
+    ahead, behind = (np.interp(t + 0.5 * over_s, t, demand) for over_s in (EVEN_OVER_S, -EVEN_OVER_S))
+    speed = np.abs(ahead - behind) / EVEN_OVER_S
     even = np.flatnonzero(speed > (1.0 - EVEN) * np.quantile(speed, 0.9))
     for part in np.split(even, np.flatnonzero(np.diff(even) > 1) + 1):
         if part.size and t[part[-1]] - t[part[0]] > LEAST_S:

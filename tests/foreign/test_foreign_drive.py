@@ -20,6 +20,7 @@ from pmsmtool.cia402 import State
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive_maps.eds import Eds, parse_eds
 from pmsmtool.errors import ConfigError, SdoAbort
+from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.sim import foreign
 from pmsmtool.sim.channel import build_line, parse_channel
 from pmsmtool.sim.foreign import file_rows
@@ -33,8 +34,8 @@ RATED_APK = 6.1
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[DriveNode]:
-    with connect("pmsmsim", f"interior-2k2?nv=:memory:&eds={path}") as connection:
+def opened(path: Path, machine: str = "interior-2k2") -> Iterator[DriveNode]:
+    with connect("pmsmsim", f"{machine}?nv=:memory:&eds={path}") as connection:
         node = DriveNode(connection, 1)
         yield node
         node.close()
@@ -115,6 +116,28 @@ def test_torque_moves_the_machine_and_is_shown(tmp_path: Path) -> None:
         assert turns > 0.01
         face = cast(ForeignDrive, simulated(node).face)
         assert face.behind is not None and face.behind.largest_step == pytest.approx(0.2, rel=0.01)
+        node.disable_voltage()
+
+
+@pytest.mark.parametrize("counts_down", [False, True])
+@pytest.mark.parametrize("rows", [epos4(), copley()])  # one controller of the position, and a cascade
+def test_the_shaft_follows_whichever_way_its_encoder_counts(
+    tmp_path: Path, rows: tuple[Row, ...], counts_down: bool
+) -> None:
+    """The loop of a drive with an encoder against the phase order ran away at the first degree."""
+    machine = load_machine_file(machine_path("interior-2k2"))
+    turned = replace(machine, simulation={**machine.simulation, "encoder_reversed": counts_down})
+    (tmp_path / "drive.toml").write_text(dump_machine_file(turned), encoding="utf-8")
+    eds = write_eds(tmp_path / "drive.eds", (*rows, (0x607A, 0, "I32", "rw", "0")))
+    with opened(eds, str(tmp_path / "drive.toml")) as node:
+        node.sdo.download(0x6060, 0, b"\1")
+        node.enable()
+        start = number(node, 0x6064, signed=True)
+        target = start + cast(ForeignDrive, simulated(node).face).set_up.counts // 4
+        node.sdo.download(0x607A, 0, target.to_bytes(4, "little", signed=True))
+        node.sdo.download(0x6040, 0, (0x3F).to_bytes(2, "little"))
+        node.connection.wait(0.5)
+        assert abs(number(node, 0x6064, signed=True) - target) < 0.1 * (target - start)
         node.disable_voltage()
 
 

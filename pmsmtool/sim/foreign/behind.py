@@ -144,6 +144,11 @@ class Behind:
     def __post_init__(self) -> None:
         self.position_gains = stored_gains(self.set_up.J_kgm2 + self.set_up.J_load_kgm2)
 
+    @property
+    def direction(self) -> float:
+        """Sign of the encoder's counts while the shaft turns along the phase order, as the set-up found it."""
+        return -1.0 if self.dictionary["encoder.reversed"].integer() else 1.0
+
     # ---- what is shown --------------------------------------------------------------------------
 
     def _signal(self, signal: Signal) -> float:

@@ -3,7 +3,8 @@
 
 Mode 1 runs trapezoids between set-points taken with bit 4 of the controlword, mode 8 follows the target as it comes.
 The loop is one controller of the position, or a position gain on a speed controller; it shares nothing with the tool's
-design. Torque is all that it commands.
+design. Torque is all that it commands; its sign is that of the encoder's counts, also of one that counts against the
+phase order: a commissioned drive knows the direction.
 """
 
 from __future__ import annotations
@@ -213,5 +214,5 @@ class PositionLoop:
         asked = torque + self._sum
         if abs(asked) < most:
             self._sum += gain * self._T * slip
-        self.behind.push(math.copysign(min(abs(asked), most), asked))
+        self.behind.push(self.behind.direction * math.copysign(min(abs(asked), most), asked))
         self._schedule.after(self._T, self._tick)
