@@ -23,6 +23,9 @@ Measured on random drives whose EMF takes little: 0 to 3 % and 0 to 2 % (docs/le
 SMALL_CURRENT = 0.006
 """Standard deviation of a gain (relative) times current over rated current: below some percent of the rated current the
 inverter's dead time holds the current back. Measured at 7 % of it: K_p -20 %."""
+HELD_BACK = 0.3
+"""By how much both gains come out too small, over the share of the current that torque pulses show not to flow at once;
+half of that is its doubt. Measured on 16 drives: 0.1 to 0.5."""
 CURRENT_BANDWIDTH, BANDWIDTH_DOUBT = 0.12, 0.7
 """What a maker's current loop has (rad/s) over its switching frequency (Hz), about: 0.05 to 0.3; the standard deviation
 of the EMF's share that follows from it (relative)."""
@@ -106,6 +109,8 @@ class Observation:
         Standard deviation of K_p, K_i and K_i / K_p (relative) by the EMF's share and by where the loop's lag lies.
     asked : AskedLoop or None
         What the current that the loop asked for says, where the drive shows it.
+    at_once : float or None
+        Share of the current that flows at once, where torque pulses showed it.
     """
 
     gain: float
@@ -114,6 +119,7 @@ class Observation:
     current_share: float = 1.0
     model_std: tuple[float, float, float] = NO_DOUBT
     asked: AskedLoop | None = None
+    at_once: float | None = None
 
     @property
     def loops(self) -> tuple[SpeedLoop, ...]:
@@ -124,12 +130,17 @@ class Observation:
         """Return what the current that was asked for says: nothing that current loop and dead time do is in it."""
         if self.asked is None:
             return self
-        return replace(self, loop=self.asked.loop, model_std=self.asked.std, current_share=math.inf)
+        return replace(self, loop=self.asked.loop, model_std=self.asked.std, at_once=1.0)
+
+    @property
+    def held_back(self) -> float:
+        """By how much the gains of the response are too small (relative), as far as torque pulses showed it."""
+        return 0.0 if self.at_once is None else HELD_BACK * (1.0 - self.at_once)
 
     @property
     def std(self) -> float:
         """Standard deviation of what a small current leaves of a gain (relative)."""
-        return SMALL_CURRENT / self.current_share
+        return SMALL_CURRENT / self.current_share if self.at_once is None else 0.5 * self.held_back
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +215,7 @@ def lag_doubt(loop: SpeedLoop, forward: SpeedLoop) -> tuple[float, float, float]
 
 
 def _log(observation: Observation, which: int) -> float:
-    return _logs(observation.loop)[which]
+    return _logs(observation.loop)[which] + (0.0 if which == RATE else observation.held_back)
 
 
 def _change(after: Observation, base: Sequence[Observation], which: int) -> tuple[float, float]:

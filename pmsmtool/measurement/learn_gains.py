@@ -17,8 +17,15 @@ from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
 from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
 from pmsmtool.identification.asked_current import asked_share, fit_asked_current, shows_asked
-from pmsmtool.identification.learned_gains import BANDWIDTH_DOUBT, NO_DOUBT, Observation, emf_doubt, lag_doubt
-from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop, StepRecord, fit_speed_loop, phase_margin_rad
+from pmsmtool.identification.learned_gains import NO_DOUBT, Observation, emf_doubt, lag_doubt
+from pmsmtool.identification.speed_loop_response import (
+    Emf,
+    SpeedLoop,
+    StepRecord,
+    fit_pulses,
+    fit_speed_loop,
+    phase_margin_rad,
+)
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Brake, Load, MachineParameters, Shaft
 from pmsmtool.measurement.changed_gains import (
@@ -32,6 +39,7 @@ from pmsmtool.measurement.changed_gains import (
     refuse_unsafe,
 )
 from pmsmtool.measurement.speed_unit import find_speed_unit
+from pmsmtool.trace import Trace
 from pmsmtool.units import rad_s_from_rpm
 
 GAIN_LITTLE_DOWN = 0.85
@@ -68,11 +76,18 @@ HOLD_S, HOLD_TIMES, HOLD_INTEGRAL = (0.04, 0.3), 5.0, 1.5
 SETTLE_S, REST_AT_LOW_S, LEAST_S = 0.8, 0.4, 2.4
 SETTLE_TIMES, LONGEST_S = 8.0, 4.0
 """Time constants of the integral for which the first speed is held, and at most how long; half of them at half gain."""
+LONGER = 2
+"""Times as long a record lasts where the current that is asked for is not shown: ripple moved its K_i by 3 to 10 %."""
+PULSES, PULSE_JUMP, PULSE_LEAST = 4, 0.4, 0.25
+"""How many torque pulses; their jump of the reference, of the speeds between which it climbs (a loop whose integral
+winds up goes as far beyond it); their least current, of that of the steps."""
+PULSE_TIMES, PULSE_SHOWN_S = 3.0, 0.02
+"""How long a pulse lasts: time constants of the current loop's integral, and time beside them (s)."""
 LEAST_AT_REST = 40
 """Samples before the first step that the noise is read from."""
 SPEED_SHARE = 0.4
 """Speed limit where none is asked for, of the largest speed of the machine: no field weakening."""
-DURATION_S = 120.0
+DURATION_S = 180.0
 SEEN_S = 0.03
 """A speed beyond its limit is seen in the samples, and the voltage off, within this time."""
 REST_S, REST_RAD = 0.3, 2e-3
@@ -196,16 +211,16 @@ def _by_asked(measured: LearnedLoop) -> LearnedLoop:
 
 
 def staircase(
-    low: float, step: float, number: int, bandwidth: float, hold_s: float
+    low: float, step: float, number: int, bandwidth: float, hold_s: float, least_s: float = LEAST_S
 ) -> tuple[list[float], list[tuple[float, float]]]:
     """Return speeds (rad/s), one per tick, that rise from ``low`` by steps on a ramp, and when the ways up are (s).
 
-    ``bandwidth``: K_p / J of the loop (1/s).
+    ``bandwidth``: K_p / J of the loop (1/s); ``least_s``: how long it lasts at least.
     """
     tick = step * bandwidth * TICK_S
     speeds = [low] * round(REST_AT_LOW_S / TICK_S)
     ways: list[tuple[float, float]] = []
-    while len(speeds) * TICK_S < LEAST_S:
+    while len(speeds) * TICK_S < least_s:
         ticks = max(1, round(HOLD_SHARES[len(ways) % 2] * hold_s / TICK_S))
         begin = len(speeds) - 1
         speeds += [low + step * (k // ticks + 1) + CLIMB * tick * (k + 1) for k in range(number * ticks)]
@@ -228,12 +243,14 @@ class _Learner:
         say: Callable[[str], None],
     ) -> None:
         self.guard, self.drive, self.put, self.emf, self.say = guard, drive, put, emf, say
+        self.least_s = LEAST_S
         limit = guard.envelope.speed_max_rad_s
         self.low, self.span = LOW_SHARE * limit, (HIGH_SHARE - LOW_SHARE) * limit
         self.bandwidth, self.hold_s, self.settle_s = FIRST_BANDWIDTH, HOLD_TIMES / FIRST_BANDWIDTH, SETTLE_S
         self.notes: list[str] = []
         self.shares: list[float] = []
         self.asks = False
+        self.step_current_a = 0.0, math.inf
 
     def run(self, gain: GainObject, integral: GainObject) -> LearnedLoop:
         """Measure everything."""
@@ -252,6 +269,9 @@ class _Learner:
         wanted_s = max(HOLD_TIMES / self.bandwidth, HOLD_INTEGRAL * integral_s)
         self.hold_s = min(max(wanted_s, HOLD_S[0]), HOLD_S[1])
         step = self._size()
+        if not self.asks:
+            self.least_s *= LONGER
+            self._show_current_loop(step)
         own = self._observe(f"with steps held for {1e3 * self.hold_s:.0f} ms", step, counts, own.loop)
         drive.oscillation.limit_a = TRIP * max(drive.oscillation.largest_a, drive.current_count_a)
         half = self._observe("with steps of half the size", 0.5 * step, counts, own.loop, own.loop.lag_s)
@@ -286,7 +306,9 @@ class _Learner:
         step = min(FIRST_STEP * self.span, most)
         for _ in range(TRIES):
             record = self._record(step, most_steps=STEPS[0])
-            shown = np.abs(record.current_a - np.median(record.current_a[record.t_s < record.references[1][0]]))
+            held = float(np.median(record.current_a[record.t_s < record.references[1][0]]))
+            self.step_current_a = abs(held), float(np.abs(record.current_a).max())
+            shown = np.abs(record.current_a - held)
             ratio = wanted / max(float(shown.max()), drive.current_count_a)
             if ENOUGH < ratio < 1.0 / ENOUGH:
                 break
@@ -296,15 +318,52 @@ class _Learner:
             step = grown
         return step
 
-    def _record(self, step: float, most_steps: int = STEPS[1]) -> StepRecord:
-        guard, drive = self.guard, self.drive
-        guard.command_speed(self.low)
-        guard.wait(self.settle_s)
-        number = min(most_steps, max(STEPS[0], int(self.span / (step * self.risen))))
-        speeds, ways = staircase(self.low, step, number, self.bandwidth, self.hold_s)
-        hold = round(TICK_S / drive.period_s)
+    def _show_current_loop(self, step: float) -> None:
+        """Take from torque pulses what the EMF and the dead time take from the current, where they show it.
+
+        The reference jumps, so that the speed loop asks for all that the drive's own limit allows: that is lowered to
+        what a step needs, or to less where the speeds leave no time for it.
+        """
+        guard, jump = self.guard, PULSE_JUMP * self.span
+        lasts_s = PULSE_TIMES / self.emf.corner_rad_s + PULSE_SHOWN_S
+        held_a, peak_a = self.step_current_a
+        level = min(1.0, jump / (step * (1.0 + self.bandwidth * lasts_s)))
+        limit_a = guard.limit_current(held_a + level * (peak_a - held_a)) if level > PULSE_LEAST else None
+        if limit_a is None:
+            return
+        up, down = round((lasts_s + 1.0 / self.bandwidth) / TICK_S), round(self.settle_s / TICK_S)
+        rest = [self.low] * round(REST_AT_LOW_S / TICK_S)
+        trace = self._taken(rest + ([self.low + jump] * up + [self.low] * down) * PULSES)
+        guard.limit_current(math.inf)
+        guard.quick_stop()
+        t, current = trace.t_s, trace["i_q_a"]
+        begins = [at for at, speed in trace.meta["steps"] if speed > self.low + 0.5 * jump]
+        parts = [(t > at) & (t < at + up * TICK_S) for at in begins]
+        held = np.median(current[t < begins[0]])
+        sign = np.sign(np.median(current[np.logical_or.reduce(parts)]) - held)
+        above = sign * (current - held) / max(limit_a - sign * held, self.drive.current_count_a)
+        shown = fit_pulses([(t[part] - at, above[part]) for at, part in zip(begins, parts, strict=True)], self.emf)
+        if shown is not None:
+            self.emf = shown
+            self.say(
+                f"the EMF takes {100 * shown.share:.2g} % of the current of torque pulses, "
+                f"{100 * (shown.at_once or 0.0):.0f} % of it flows at once"
+            )
+        guard.enable()
+
+    def _taken(self, speeds: Sequence[float]) -> Trace:
+        """Record speeds that follow each other tick by tick, from the first one, which is held before."""
+        self.guard.command_speed(self.low)
+        self.guard.wait(self.settle_s)
+        hold = round(TICK_S / self.drive.period_s)
         excitation = Excitation(Shape.BUFFER, Injection.SPEED, 0.0, hold_periods=hold, buffer=speeds)
-        trace = guard.record(("theta_m_rad", "i_q_a"), hold * len(speeds), excitation=excitation)
+        return self.guard.record(("theta_m_rad", "i_q_a"), hold * len(speeds), excitation=excitation)
+
+    def _record(self, step: float, most_steps: int = STEPS[1]) -> StepRecord:
+        drive = self.drive
+        number = min(most_steps, max(STEPS[0], int(self.span / (step * self.risen))))
+        speeds, ways = staircase(self.low, step, number, self.bandwidth, self.hold_s, self.least_s)
+        trace = self._taken(speeds)
         t, position, current = trace.t_s, trace["theta_m_rad"], trace["i_q_a"]
         references = [(float(at), float(value)) for at, value in trace.meta["steps"]]
         still = t < references[1][0]
@@ -337,7 +396,7 @@ class _Learner:
         loop = fit_speed_loop(record, self.emf, first, lag_s)
         model_std = NO_DOUBT
         if first is not None and lag_s is None:  # what scales rest on
-            most = BANDWIDTH_DOUBT * self.emf.share
+            most = self.emf.share_std
             shares = (self.emf.share - most, self.emf.share + most)
             low, high = (fit_speed_loop(record, self.emf._replace(share=share), loop) for share in shares)
             placed = lag_doubt(loop, fit_speed_loop(record, self.emf, loop, forward=True))
@@ -348,7 +407,8 @@ class _Learner:
             self.asks = shows_asked(self.shares, self.emf)
         asked = fit_asked_current(record, loop) if self.asks else None
         peak = float(np.abs(record.current_a).max())
-        found = Observation(counts[GAIN], counts[INTEGRAL], loop, peak / self.drive.rated_apk, model_std, asked)
+        share = peak / self.drive.rated_apk
+        found = Observation(counts[GAIN], counts[INTEGRAL], loop, share, model_std, asked, self.emf.at_once)
         margin, seen = math.degrees(_margin(found, (1.0, 1.0))), found.loops[-1]
         self.say(
             f"{what}: K_p/J {seen.K_p_per_J:.4g} 1/s, K_i/K_p {seen.K_i_per_J / seen.K_p_per_J:.3g} 1/s, "

@@ -16,7 +16,15 @@ from pmsmtool.drive_maps.drive_map import LETTERS, Cell, DriveMap, Form
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.drive_maps.motion_objects import UNDECIDED
 from pmsmtool.drive_maps.wire_units import wire_unit
-from pmsmtool.identification.learned_gains import Convention, Learned, Rotor, convention, gain_scale, integral_scale
+from pmsmtool.identification.learned_gains import (
+    BANDWIDTH_DOUBT,
+    Convention,
+    Learned,
+    Rotor,
+    convention,
+    gain_scale,
+    integral_scale,
+)
 from pmsmtool.identification.speed_loop_response import Emf
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import torque_per_ampere
@@ -145,7 +153,8 @@ def rotor_of(file: MachineFile) -> Rotor:
 
 def emf_of(file: MachineFile) -> Emf:
     """Return what the EMF takes from the current loop of a drive that nobody knows."""
-    return Emf(rotor_of(file).lagging, file.machine.R_s_ohm / file.machine.L_q_h)
+    share = rotor_of(file).lagging
+    return Emf(share, file.machine.R_s_ohm / file.machine.L_q_h, BANDWIDTH_DOUBT * share)
 
 
 def learned_gains(file: MachineFile, measured: LearnedLoop) -> dict[str, Learned]:

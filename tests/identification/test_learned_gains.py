@@ -135,3 +135,19 @@ def test_a_small_current_leaves_gains_unknown() -> None:
     base, gain_changed, _ = observed("value")
     small = [replace(base[0], current_share=0.07), *base[1:]]
     assert gain_scale(base, gain_changed, ROTOR, P).scale and gain_scale(small, gain_changed, ROTOR, P).scale is None
+
+
+def test_what_does_not_flow_at_once_is_added_and_half_of_it_doubted() -> None:
+    """A drive at 22 % of its rated current with K_p 5.5 % too small, and one at 10 % with 16 to 21 %."""
+    base, gain_changed, integral_changed = observed("value")
+
+    def shown(at_once: float) -> list[Observation]:
+        return [replace(one, current_share=0.1, at_once=at_once) for one in (*base, gain_changed, *integral_changed)]
+
+    own, half, less, *changed = shown(0.84)
+    gain = gain_scale([own, half], less, ROTOR, P)
+    assert gain.scale == pytest.approx(COUNT * math.exp(0.048), rel=1e-3) and gain.half_width < 0.1
+    found = integral_scale([own, half], less, changed, ROTOR, I)
+    assert found.scale == pytest.approx(J * A0 * RATE / INTEGRALS * math.exp(0.048), rel=3e-3)
+    own, half, less, *_ = shown(0.40)
+    assert gain_scale([own, half], less, ROTOR, P).scale is None

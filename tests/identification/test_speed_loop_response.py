@@ -9,8 +9,15 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
-from pmsmtool.identification.speed_loop_response import Emf, StepRecord, fit_speed_loop, phase_margin_rad
+from pmsmtool.identification.speed_loop_response import (
+    Emf,
+    StepRecord,
+    fit_pulses,
+    fit_speed_loop,
+    phase_margin_rad,
+)
 from pmsmtool.measurement.learn_gains import TICK_S, staircase
 
 PLANT_S = 1e-4
@@ -83,3 +90,46 @@ def test_phase_margin_is_that_of_the_open_loop() -> None:
     loop = (a * s + b) / (s * s * (1.0 + lag * s / 3.0) ** 3)
     at = int(np.argmin(np.abs(np.abs(loop) - 1.0)))
     assert phase_margin_rad(a, b, lag) == pytest.approx(math.pi + np.angle(loop[at]), abs=1e-3)
+
+
+SHARE, AT_ONCE, CORNER, LASTS_S = 0.19, 0.45, 186.0, 0.11
+"""Of a drive with 10 % of its rated current: K_p of its response is 16 % too small."""
+SHARE_TOL, AT_ONCE_TOL = 0.01, 0.05
+"""Measured 0.001 and 0.029."""
+RIPPLE, ORDER_RAD_S = 0.06, 700.0
+ASSUMED = Emf(0.2, CORNER, 0.14)
+
+
+def pulses(scale: float = 1.0, lasts_s: float = LASTS_S) -> list[tuple[Array, Array]]:
+    """Integrate a PI current loop against the resistance of the dead time and an EMF; the limit is what it is asked."""
+    w, extra, dt = 2500.0, 2500.0 * (1.0 / AT_ONCE - 1.0) - CORNER, 2e-5
+    current = integral = emf = 0.0
+    rows = []
+    for k in range(round(0.2 / dt)):
+        asked = 1.0 if k * dt < lasts_s else 0.0
+        error = asked - current
+        integral += w * CORNER * error * dt
+        emf += w * CORNER * SHARE * current * dt
+        current += (w * error + integral - emf - (CORNER + extra) * current) * dt
+        rows.append((k * dt, scale * current))
+    t, y = np.array(rows[::50]).T
+    return [(t, y * (1.0 + RIPPLE * np.sin(ORDER_RAD_S * t + phase))) for phase in (0.0, 1.5, 3.0, 4.5)]
+
+
+def test_torque_pulses_show_what_emf_and_dead_time_take() -> None:
+    found = fit_pulses(pulses(), ASSUMED)
+    assert found is not None and found.at_once == pytest.approx(AT_ONCE, abs=AT_ONCE_TOL)
+    assert found.share == pytest.approx(SHARE, abs=SHARE_TOL) and found.share_std < 0.3 * ASSUMED.share_std
+
+
+@pytest.mark.parametrize(
+    ("shown", "assumed"),
+    [
+        (pulses(1.3), ASSUMED),  # more than the limit: that is another unit
+        (pulses(), Emf(0.01, CORNER, 0.007)),
+        (pulses(lasts_s=0.02), ASSUMED),
+        (pulses(0.0), ASSUMED),  # no current at all
+    ],
+)
+def test_pulses_that_are_none_show_nothing(shown: list[tuple[Array, Array]], assumed: Emf) -> None:
+    assert fit_pulses(shown, assumed) is None
