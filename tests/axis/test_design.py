@@ -47,6 +47,7 @@ from pmsmtool.design.ratings import ratings_of
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.envelope import largest_torque
+from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.flash.journal import Entry
@@ -172,6 +173,27 @@ def test_a_position_loop_is_no_faster_than_a_speed_loop_that_its_objects_slow(K_
     assert cut[CASCADE[0]] == pytest.approx(0.25 * whole[CASCADE[0]], rel=1e-3)
     assert cut[SPEED[0]] == pytest.approx(K_p_most * whole[SPEED[0]], rel=1e-3)
     assert cut.facts["axis_margins_kept"]
+
+
+@pytest.mark.chain
+def test_an_integral_that_its_object_makes_stronger_leaves_less_to_the_position_loop() -> None:
+    """The longest integral time of a Copley was 0.4 of the designed one: 38.5 degrees were left, and said."""
+    plain = design_axis(machine(0.0, 0.0), TuneRequest(), ASKED, _with_longest(0.0))
+    time_s = plain[SPEED[0]] / plain[SPEED[1]]
+    made = design_axis(machine(0.0, 0.0), TuneRequest(), ASKED, _with_longest(0.6 * time_s))
+    assert made[SPEED[1]] == pytest.approx(plain[SPEED[1]] / 0.6, rel=1e-3)
+    assert made.facts["axis_margins_kept"] and 0.3 < made[CASCADE[0]] / plain[CASCADE[0]] < 0.9
+    assert "axis_error_rad" not in made.facts, "it was predicted with the larger gain"
+
+
+def _with_longest(time_s: float) -> DriveMap:
+    """Return a drive whose object of the integral time ends at ``time_s``; 0: far beyond what is asked for."""
+    rows = [
+        MeasuredRow(SPEED[0], 0x60F9, 1, "UNSIGNED32", "value", "", 1e-7, "N m s/rad", 0.1),
+        MeasuredRow(SPEED[1], 0x60F9, 2, "UNSIGNED16", "time", SPEED[0], (time_s or 100.0) / 65535.0, "s", 0.1),
+        MeasuredRow(CASCADE[0], 0x60FB, 1, "UNSIGNED32", "value", "", 1e-6, "1/s", 0.1),
+    ]
+    return with_measured(load_family("cia402"), 0x999, 1, rows, "on a bench", None)
 
 
 def test_a_gain_beyond_its_object_is_cut_and_judged_so() -> None:
