@@ -567,7 +567,7 @@ def test_a_second_mass_must_explain_more_than_a_rigid_shaft_that_rings() -> None
         and found.highest_hz == found.frequency_hz[coherence >= 0.5][-1]
     )
     ratio = (found.found["resonance_hz"].value / found.found["antiresonance_hz"].value) ** 2
-    assert found.reason == f"two masses, J_load/J_motor {ratio - 1.0:.3g}, over {found.highest_hz:.3g} Hz"
+    assert found.reason == f"two masses, J_load/J_motor {ratio - 1.0:.3g}, measured up to {found.highest_hz:.3g} Hz"
     assert found.inertia is not None and found.inertia.value == pytest.approx((700.0 / 550.0) ** 2 / 500.0, rel=0.02)
 
 

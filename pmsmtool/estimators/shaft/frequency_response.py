@@ -238,7 +238,7 @@ def _judged(
         none = FrequencyResponse(*facts, chi2, gain, reason=reason, inertia=one, shown_hz=to_hz, suspected_hz=pair)
         return none, lines, rigid
     resonance, antiresonance = estimates["resonance_hz"].value, estimates["antiresonance_hz"].value
-    reason = f"two masses, J_load/J_motor {(resonance / antiresonance) ** 2 - 1.0:.3g}, over {highest:.3g} Hz"
+    reason = f"two masses, J_load/J_motor {(resonance / antiresonance) ** 2 - 1.0:.3g}, measured up to {highest:.3g} Hz"
     return FrequencyResponse(*facts, chi2, gain, estimates, reason, both), lines, rigid
 
 
