@@ -25,6 +25,7 @@ from pmsmtool.identification.by_injection import RESONANCE
 from pmsmtool.identification.frequency_response import RESPONSE_FILE, encoder_errors, frequency_response_of
 from pmsmtool.identification.mechanics import (
     ELASTIC_FALLBACK,
+    LINEAR_FALLBACK,
     MEAN_FALLBACK,
     PLAY_FALLBACK,
     Pushes,
@@ -234,6 +235,34 @@ def test_pushes_that_tell_another_inertia_are_believed_only_where_a_small_torque
     assert means["J_kgm2"].fallback.startswith(PLAY_FALLBACK) and beside is not None and not beside.inertia
     _, means, none = of_no_rigid_shaft(Pushed(0.0, 0.0320), None)
     assert means["J_kgm2"].fallback == MEAN_FALLBACK and none is None
+
+
+class OneFrequency(Pushed):
+    """The same, which swing at the resonance of a small torque."""
+
+    def swing_hz(self, response: FrequencyResponse | None) -> float:
+        return 0.0 if response is not None and response.found else 40.0
+
+
+@pytest.mark.parametrize("fitted", [1.46e-3, 0.0])
+def test_a_shaft_that_swings_at_one_frequency_has_no_play(fitted: float) -> None:
+    """Two masses at 38 Hz without play: 1.31e-3 kg m2 by a small torque, 1.46e-3 by pulses counted as play."""
+    nothing = np.zeros(0)
+
+    def told(resonance_hz: float) -> tuple[Estimate | None, FrequencyResponse | None]:
+        response = FrequencyResponse(nothing, nothing.astype(complex), nothing, nothing, 800.0, 1.0, 1.0, 99.0,
+                                     {"resonance_hz": Estimate(resonance_hz, 0.1, 0.0, "Hz")},
+                                     inertia=Estimate(1.31e-3, 1e-5, 0.0, "kg m2"))  # fmt: skip
+        found, means, kept = of_no_rigid_shaft(OneFrequency(fitted, 1.46e-3), response)
+        return means.get("J_kgm2") if found is None else found.J, kept
+
+    J, response = told(38.0)
+    assert response is not None and response.found and response.inertia is not None
+    J = response.inertia if J is None else J
+    assert 1.31e-3 <= J.value <= 1.46e-3 and J.value - 2.1 * J.std < 1.31e-3
+    assert J.fallback in ("", LINEAR_FALLBACK)
+    J, response = told(30.0)  # 1.33 times
+    assert J is not None and J.fallback.startswith(PLAY_FALLBACK) and response is not None and not response.found
 
 
 def test_a_resonance_that_depends_on_the_torque_is_play() -> None:
