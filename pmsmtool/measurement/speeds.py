@@ -35,6 +35,9 @@ PUSH_SHARE = 0.5
 PUSH_SPEED_SHARE = 0.12
 PUSH_TAIL = 16
 """Last part of a push whose means count: one of so many."""
+ERROR_ANGLES = 48
+"""Angles of a turn over which the inverter's error of a push is averaged. A light shaft gets a current below the
+curve's knee; the whole plateau taken from its voltage left no flux linkage, and psi_f was refused."""
 PUSH_END_SHARE, SLOW_PUSH_SHARE = 0.9, 0.5
 """Speed at which the drive ends a push by itself, of the speed limit; the speed of one that would get there."""
 PUSH_REACHED = 0.4
@@ -43,8 +46,9 @@ a flux linkage of half its value, told at 1 % of the speed limit, led the run in
 SECOND_PUSH, FAR = (1.5, 0.6), 0.6
 """Current of the push that tells friction, of the first one that the shaft answered: less where that one went far, of
 what the pushes aim at."""
-PUSH_TRIES = 4
-"""Pushes in either direction, each of twice the time of the one before."""
+PUSH_TRIES, PUSH_FLOWED = 6, 0.5
+"""Pushes in either direction, each of twice the time of the one before, or, where on average that
+share of a current flowed that may be larger, of twice the current: a light shaft stayed in its cogging, at any time."""
 GROWTH, LITTLE_SHARE, GROWN_SHARE, PUSHES_MOST = (2.0, 1.5), 0.1, 0.55, 13
 """By what the first current grows until the shaft answers, below and above a share of the test current, up to which it
 does, and how often. Twice a current that friction of 37 % of the rated torque held brought a shaft to its speed limit.
@@ -193,21 +197,26 @@ class SpeedStage:
             omega = float(fastest["omega_e_rad_s"][tail].mean())
             if abs(omega) >= PUSH_REACHED * reached * pole_pairs:
                 break
-            decimation *= 2
+            flowed = abs(float(fastest["i_q_a"].mean()))
+            if flowed > PUSH_FLOWED * current and current < PUSH_SHARE * limits.I_test_apk:
+                current = min(2.0 * current, PUSH_SHARE * limits.I_test_apk)
+            else:
+                decimation *= 2
         for k, push in enumerate(pushes):
             self.keep(f"push_{k}", push)
         gained, shown = (float(one[tail].mean()) for one in self._gained(fastest))
         omega += rate * pole_pairs * (gained - shown)
         i_q = float(fastest["i_q_a"][tail].mean())
-        error = resistance.V_dead_v * (1.0 if i_q > 0.0 else -1.0) * 4.0 / math.pi
+        around = np.linspace(0.0, 2.0 * math.pi, ERROR_ANGLES, endpoint=False)
+        error = float(np.mean(resistance.curve.error_dq_v(np.zeros_like(around), np.full_like(around, i_q), around)[1]))
         psi = (float(fastest["u_q_v"][tail].mean()) - resistance.R_measured.value * i_q - error) / omega
         if not psi > 0.0:
             raise refuse(
                 "E_EXCITATION",
                 f"the voltage at {omega:.3g} rad/s shows no flux linkage ({psi:.3g} Wb)",
                 stage="speed run",
-                likely="the torque pulses were too slow for this inverter's dead time",
-                hint="allow a higher --speed-max",
+                likely="friction or cogging held the shaft, or the dead time the current of the torque pulses",
+                hint="allow more current by --i-max, or a higher --speed-max",
             )
         return psi, torque_per_ampere(pole_pairs, psi) / rate
 
