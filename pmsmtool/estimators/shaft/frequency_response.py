@@ -36,6 +36,7 @@ from pmsmtool.estimators.estimate import (
 from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt
 from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, STAGE, local_polynomials, transforms, without_noise
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.two_masses import CERTAIN_ZETA
 from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
@@ -49,8 +50,6 @@ COHERENT_LEAST = 8
 """Coherent lines below which no response is given: a heavy load shows at its resonance only (29 of a load of 11 J)."""
 INFORMATION_GAIN = 10.0
 """Smallest difference of the information criterion: very strong evidence (Kass and Raftery 1995)."""
-ZETA_MOST = 0.5
-"""Damping from which a pair of poles is no resonance."""
 RESONANCE_STD, ANTIRESONANCE_STD = 0.03, 0.1
 """Largest relative standard deviations of a resonance and an antiresonance that are claimed: those of a heavy load have
 few lines (130 +- 5.5 of 137 Hz), and a controller that knows neither shakes it."""
@@ -412,7 +411,7 @@ def _shown(lines: _Lines, rigid: Fit) -> tuple[str, float]:
 def _against(fit: Fit, chi2: float, gain: float, estimates: dict[str, Estimate], frequency: Array) -> str:
     """Return what speaks against a second mass, empty where nothing does."""
     resonance, antiresonance = estimates["resonance_hz"], estimates["antiresonance_hz"]
-    zeta = estimates["resonance_zeta"].value
+    zeta = estimates["resonance_zeta"]
     if not gain > INFORMATION_GAIN:
         return f"the shaft is rigid, the information criterion gains {gain:.3g} by a second mass"
     if not fit.converged:
@@ -425,8 +424,8 @@ def _against(fit: Fit, chi2: float, gain: float, estimates: dict[str, Estimate],
         return f"zeros and poles at {resonance.value:.3g} Hz are less than {100.0 * APART:g} % apart"
     if resonance.value - antiresonance.value < APART_STDS * math.hypot(resonance.std, antiresonance.std):
         return f"zeros and poles at {resonance.value:.3g} Hz are no {APART_STDS:g} standard deviations apart"
-    if zeta > ZETA_MOST:
-        return f"the damping {zeta:.3g} is above {ZETA_MOST:g}"
+    if zeta.value - COVERAGE_FACTOR * zeta.std > CERTAIN_ZETA:
+        return f"poles at {resonance.value:.3g} Hz damped by {zeta.value:.2g}, and no coupling by {CERTAIN_ZETA:g}"
     if resonance.std > RESONANCE_STD * resonance.value or antiresonance.std > ANTIRESONANCE_STD * antiresonance.value:
         return (
             f"poles at {resonance.value:.4g} Hz are known to {resonance.std:.2g} Hz and zeros at "
