@@ -153,7 +153,7 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
     if evaluation.mechanics is not None and evaluation.mechanics.note:
         lines.append(evaluation.mechanics.note)
     lines += timing_warnings(evaluation.shown)
-    lines += [f"{check.name} {check.verdict}" for check in evaluation.checks if not check.agrees]
+    lines += [f"{check.name} {check.verdict}; {IF_APART[check.of]}" for check in evaluation.checks if not check.agrees]
     if evaluation.pairs is not None and not evaluation.pairs.judged:
         lines.append("the phases were not compared: the rotor did not come to rest on the three pairs")
     inductance = evaluation.inductance
@@ -165,6 +165,14 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
     if evaluation.flux_map is not None:
         lines += evaluation.flux_map.notes
     return [*lines, *filter(None, [frequency_response.response_note(evaluation.frequency_response)])]
+
+
+IF_APART = {
+    "psi_f_wb": "the inverter's error weighs less at a larger --speed-max; `identify psi` measures again",
+    "L_q_h": "flux over current at speed, and its change at standstill, differ where the q axis saturates; "
+    "`identify map` measures it, `commission --flux-map` designs with it",
+}
+"""What to do where a second method disagrees, by the quantity."""
 
 
 def _bend_note(inductance: InductanceResult, *, tried: bool) -> list[str]:

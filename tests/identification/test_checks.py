@@ -12,7 +12,8 @@ import pytest
 from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.identification.evaluate import Evaluation
-from pmsmtool.identification.value_verdict import summary_of
+from pmsmtool.identification.request import IdentifyRequest
+from pmsmtool.identification.value_verdict import IF_APART, summary_of, warnings_of
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.refusals import refuse
 
@@ -49,3 +50,11 @@ def test_why_a_frequency_response_was_refused_is_in_the_line_of_the_stage() -> N
     assert said == f"frequency response refused: {refused.what}" and said.count("E_COHERENCE") == 1
     assert summary_of(without, {}, ("R", "frf")) == "", "the verdict on what was asked for says it"
     assert summary_of(bare, {}, ("R",)) == ""
+
+
+def test_a_disagreement_ends_with_what_to_do() -> None:
+    """`L_q_h_apparent DISAGREES with L_q_h` was the whole line."""
+    apart = evaluation(0.02, 0.011)
+    (line,) = [line for line in warnings_of(apart, IdentifyRequest(("psi",))) if "DISAGREES" in line]
+    assert line.endswith(IF_APART["psi_f_wb"]) and "--speed-max" in line
+    assert {"psi_f_wb", "L_q_h"} == set(IF_APART) and "`commission --flux-map`" in IF_APART["L_q_h"]
