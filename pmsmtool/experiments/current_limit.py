@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import SafetyRefusal
 from pmsmtool.experiments.mechanics_run import FIRST_S, ShaftAnswer
-from pmsmtool.experiments.speed_run import COAST_BAND, reach
+from pmsmtool.experiments.speed_run import COAST_BAND, LOOK_S, QUICK_LOOK_S, reach
 from pmsmtool.experiments.standstill import ARRIVAL_LIMIT_S
 
 LimitCurrent = Callable[[float], float | None]
@@ -187,9 +187,13 @@ REACH_S, REST_S = 2.0, 1.0
 """Longest time until the speed stands, and until the shaft rests again (s)."""
 SEEN_S = 0.2
 """Shortest window in which the speed is looked at (s), and at least one turn."""
+QUICK_TURNS, QUICK_BAND = 1.0 / 3.0, 0.08
+"""The same with an accuracy, in turns; and the relative distance from the limit at which it begins, within ``MOST``."""
 
 
-def show_speed_limit(drive: Drive, limit_speed: LimitSpeed, largest_rad_s: float, pole_pairs: int) -> LimitShown | None:
+def show_speed_limit(
+    drive: Drive, limit_speed: LimitSpeed, largest_rad_s: float, pole_pairs: int, *, quick: bool = False
+) -> LimitShown | None:
     """Ask for one and a half times a lowered limit and see what the shaft does; None where there is no limit.
 
     Parameters
@@ -202,7 +206,10 @@ def show_speed_limit(drive: Drive, limit_speed: LimitSpeed, largest_rad_s: float
         Largest mechanical speed of the run.
     pole_pairs : int
         Of the machine.
+    quick : bool
+        Whether a third of a turn is enough to look at, by shorter looks; the shaft then coasts on return.
     """
+    look_s = QUICK_LOOK_S if quick else LOOK_S
     kept = limit_speed(SHARE * largest_rad_s)
     if kept is None:
         return None
@@ -210,11 +217,14 @@ def show_speed_limit(drive: Drive, limit_speed: LimitSpeed, largest_rad_s: float
         drive.enable()
         asked = min(OVER * kept, largest_rad_s)
         drive.command_speed(asked)
-        reach(drive, kept * pole_pairs, limit_s=REACH_S, band_rad_s=COAST_BAND * kept * pole_pairs)
-        periods = math.ceil(max(SEEN_S, 2.0 * math.pi / kept) / drive.period_s)
+        band = (QUICK_BAND if quick else COAST_BAND) * kept * pole_pairs
+        reach(drive, kept * pole_pairs, limit_s=REACH_S, band_rad_s=band, look_s=look_s)
+        turn_s = (QUICK_TURNS if quick else 1.0) * 2.0 * math.pi / kept
+        periods = math.ceil(max(SEEN_S, turn_s) / drive.period_s)
         seen = abs(drive.average(("omega_e_rad_s",), periods)["omega_e_rad_s"]) / pole_pairs
         drive.command_speed(0.0)
-        reach(drive, 0.0, limit_s=REST_S, band_rad_s=COAST_BAND * kept * pole_pairs)
+        if not quick:
+            reach(drive, 0.0, limit_s=REST_S, band_rad_s=band)
         drive.disable()
     finally:
         limit_speed(math.inf)

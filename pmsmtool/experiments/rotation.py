@@ -50,6 +50,15 @@ random drives (21 rad/s on 0.35 of the test current). Their rotors left the vect
 TURN_S = 0.6
 """Time of a turn from standstill to standstill: as much at 0.15 of the test current, of all but the slowest."""
 TURN_DWELL_S = 0.015
+SWUNG_S = 0.0
+"""In place of the time of a turn: as long as the rotor swings."""
+SWUNG_RAD = math.pi / 3.0
+"""Longest turn by one swing."""
+SWING_LOOK_S, SPANS = 0.003, 8
+"""Time between two looks at a swing (s), and spans of the looks so far: the last two show the speed of the next one."""
+STUCK_S, SWING_MOST_S = 0.12, 1.5
+"""A rotor that has not moved by then is held by friction, as the current of the slowest loop has come; and the longest
+wait, half a swing of a load of 50 times the rotor's inertia."""
 LOOK_S = 0.03
 LOOKS = 4
 """Looks at the encoder over which a shaft at rest does not move: two alone also find the end of a swing at rest."""
@@ -74,14 +83,42 @@ def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float, turn
     """Turn a current vector along half a cosine, so that the rotor follows instead of jumping; return the time (s).
 
     A rotor left half an electrical turn off its vector stands on a top: friction holds it there until the current is
-    large, and then it falls over with all of it.
+    large, and then it falls over with all of it. With :data:`SWUNG_S` the rotor itself says how long a turn takes: it
+    swings about the middle of a sixth of a turn, and the vector goes to its end when the rotor turns back there.
     """
+    if turn_s == SWUNG_S:
+        parts = max(1, math.ceil(abs(end_rad - start_rad) / SWUNG_RAD - 1e-6))
+        part, waited = (end_rad - start_rad) / parts, 0.0
+        for k in range(parts):
+            drive.command_current(i_a, 0.0, fixed_angle_rad=start_rad + (k + 0.5) * part)
+            waited += turns_back(drive)
+            drive.command_current(i_a, 0.0, fixed_angle_rad=start_rad + (k + 1.0) * part)
+        return waited
     steps = round(turn_s / TURN_DWELL_S)
     for k in range(1, steps + 1):
         way = 0.5 - 0.5 * math.cos(math.pi * k / steps)
         drive.command_current(i_a, 0.0, fixed_angle_rad=start_rad + (end_rad - start_rad) * way)
         drive.wait(TURN_DWELL_S)
     return steps * TURN_DWELL_S
+
+
+def turns_back(drive: Drive) -> float:
+    """Wait until a rotor that swings is at its turning point, or stands still; return the time (s)."""
+    first = drive.live("theta_m_rad")
+    ways, waited, fastest = [0.0], 0.0, 0.0
+    while waited < SWING_MOST_S and (max(ways) > REST_SPAN_RAD or waited < STUCK_S):
+        drive.wait(SWING_LOOK_S)
+        waited += SWING_LOOK_S
+        ways.append(abs(math.remainder(drive.live("theta_m_rad") - first, 2.0 * math.pi)))
+        span = max(1, len(ways) // SPANS)
+        if len(ways) <= 2 * span or max(ways) <= REST_SPAN_RAD:
+            continue
+        speed, before = ((ways[k] - ways[k - span]) / span for k in (-1, -1 - span))
+        fastest = max(fastest, speed)
+        next_speed = speed + (speed - before) * (0.5 + 1.0 / span)
+        if next_speed <= 0.0 and speed < 0.5 * fastest:
+            break
+    return waited
 
 
 def come_to_rest(drive: Drive, i_a: float, angle_rad: float, *, limit_s: float = REST_LIMIT_S + BRAKED_S) -> float:

@@ -29,9 +29,10 @@ Q_AT = (1, 2)
 """Speeds at which q currents are held, too."""
 MEANS = ("u_d_v", "u_q_v", "i_d_a", "i_q_a", "omega_e_rad_s", "T_magnet_c", "T_winding_c", "flags")
 
-LOOK_S = 0.05
-SLOWEST = 0.82
-"""Part of the set speed below which a coasting shaft is brought back to it."""
+LOOK_S, QUICK_LOOK_S, LOOKS = 0.05, 0.025, 2
+"""Time of a look at the speed (s), and in how many of them one after the other it has arrived."""
+SLOWEST, QUICK_SLOWEST = 0.82, 0.7
+"""Part of the set speed below which a coasting shaft is brought back to it; of a run with an accuracy."""
 COAST_BAND = 0.03
 COAST_LIMIT_S = 3.0
 """Relative distance and time for a shaft that is left to coast at once: its windows measure where it is. An overshoot
@@ -84,6 +85,9 @@ class SpeedPlan:
         Rough mechanical acceleration per q current (rad/s2/A), and the one of the speed controller (rad/s2).
     shares, d_shares, q_at : tuple
         As :data:`SHARES`, :data:`D_SHARES` and :data:`Q_AT`.
+    quick : bool
+        Whether a shaft that coasts well enough at its first speed is left to coast at the others as soon as it is seen
+        there, without a look at what would hold it.
     """
 
     omega_max_rad_s: float
@@ -99,6 +103,12 @@ class SpeedPlan:
     shares: tuple[float, ...] = SHARES
     d_shares: tuple[tuple[float, ...], ...] = D_SHARES
     q_at: tuple[int, ...] = Q_AT
+    quick: bool = False
+
+    @property
+    def slowest(self) -> float:
+        """Part of the set speed below which a coasting shaft is brought back to it."""
+        return QUICK_SLOWEST if self.quick else SLOWEST
 
     def stations(self) -> list[tuple[float, list[tuple[float, float]]]]:
         """Return the mechanical speeds in the order they are reached, and the vectors that are held at each."""
@@ -178,13 +188,13 @@ def coast_through(drive: Drive, plan: SpeedPlan, pole_pairs: int) -> Rows:
     The drive is enabled on entry with a speed controller that holds the machine; it is asked for standstill on return.
     """
     rows: Rows = []
-    before = 0.0
+    before, held = 0.0, math.inf
     for speed, vectors in plan.stations():
         omega_e = speed * pole_pairs
-        controlled, held = False, 0.0
+        controlled = False
         for i_d, i_q in vectors:
-            if not controlled or abs(rows[-1]["omega_second_rad_s"]) < SLOWEST * abs(omega_e):
-                held = reach_and_hold(drive, plan, speed, before, pole_pairs)
+            if not controlled or abs(rows[-1]["omega_second_rad_s"]) < plan.slowest * abs(omega_e):
+                held = reach_and_hold(drive, plan, speed, before, pole_pairs, coasts=plan.quick and held == 0.0)
                 controlled, settle_s, before = True, plan.first_s, speed
             drive.command_current(i_d, i_q + held)
             drive.wait(settle_s)
@@ -194,16 +204,20 @@ def coast_through(drive: Drive, plan: SpeedPlan, pole_pairs: int) -> Rows:
     return rows
 
 
-def reach_and_hold(drive: Drive, plan: SpeedPlan, speed: float, before: float, pole_pairs: int) -> float:
+def reach_and_hold(
+    drive: Drive, plan: SpeedPlan, speed: float, before: float, pole_pairs: int, *, coasts: bool = False
+) -> float:
     """Bring the shaft to a mechanical speed (rad/s) from the one ``before``; return the q current that keeps it (A).
 
-    0 where the shaft coasts through a window well enough without.
+    0 where the shaft coasts through a window well enough without, which is not looked for where it ``coasts``.
     """
     drive.command_speed(speed)
     omega_e = speed * pole_pairs
     ramp_s = min(RAMP_MOST_S, RAMP_DOUBT * abs(speed - before) / plan.acceleration_rad_s2)
-    reach(drive, omega_e, limit_s=COAST_LIMIT_S + ramp_s, band_rad_s=COAST_BAND * abs(omega_e))
-    return _holding(drive, plan, speed, pole_pairs)
+    look_s, band = QUICK_LOOK_S if plan.quick else LOOK_S, COAST_BAND * abs(omega_e)
+    limit_s = COAST_LIMIT_S + ramp_s
+    reach(drive, omega_e, limit_s=limit_s, band_rad_s=band, look_s=look_s, looks=1 if coasts else LOOKS)
+    return 0.0 if coasts else _holding(drive, plan, speed, pole_pairs)
 
 
 def _holding(drive: Drive, plan: SpeedPlan, speed: float, pole_pairs: int) -> float:
@@ -252,15 +266,23 @@ def speeds_trace(rows: Rows, facts: Mapping[str, float]) -> Trace:
     return table(rows, [float(k) for k in range(len(rows))], **facts)
 
 
-def reach(drive: Drive, omega_e_rad_s: float, *, limit_s: float = REACH_LIMIT_S, band_rad_s: float = 0.0) -> float:
-    """Wait until the speed has arrived within a band, seen twice, or the limit is over; return the time (s)."""
-    periods = max(1, round(0.5 * LOOK_S / drive.period_s))
+def reach(
+    drive: Drive,
+    omega_e_rad_s: float,
+    *,
+    limit_s: float = REACH_LIMIT_S,
+    band_rad_s: float = 0.0,
+    look_s: float = LOOK_S,
+    looks: int = LOOKS,
+) -> float:
+    """Wait until the speed has arrived within a band, seen so often, or the limit is over; return the time (s)."""
+    periods = max(1, round(0.5 * look_s / drive.period_s))
     waited = 0.0
     seen = 0
-    while waited < limit_s and seen < 2:
-        drive.wait(0.5 * LOOK_S)
+    while waited < limit_s and seen < looks:
+        drive.wait(0.5 * look_s)
         omega = drive.average(("omega_e_rad_s",), periods)["omega_e_rad_s"]
-        waited += LOOK_S
+        waited += look_s
         seen = seen + 1 if abs(omega - omega_e_rad_s) <= max(band_rad_s, NEAR * abs(omega_e_rad_s)) else 0
     return waited
 

@@ -19,8 +19,8 @@ Axis = Literal["d", "q"]
 
 SHOT_SAMPLES = 2048
 SEARCH_SAMPLES = 240
-SEARCH_LEAD_S = 0.05
-"""Lead of a shot of the search: the ripple is there at once, only the bias still moves."""
+SEARCH_LEAD_S, SEARCH_LEAD_SHARE = 0.05, 0.5
+"""Lead of a shot of the search, and at most so much of the plan's: the ripple is there at once, the bias moves."""
 BUS_ALLOWANCE_S = 2.0
 """The injection goes on this much longer than lead and record need: slow adapters arm the recorder late."""
 BIAS_BANDWIDTH_RAD_S = 2.0 * math.pi * 15.0
@@ -86,7 +86,7 @@ def find_amplitude(drive: Drive, plan: SquarePlan, axis: Axis, first_v: float | 
 
     ``first_v`` is the amplitude of the first one; None: small enough for any machine.
     """
-    quick = replace(plan, lead_s=SEARCH_LEAD_S)
+    quick = replace(plan, lead_s=min(SEARCH_LEAD_S, SEARCH_LEAD_SHARE * plan.lead_s))
     amplitude = min(FIRST_SHARE * plan.u_max_v if first_v is None else first_v, plan.u_max_v)
     for _ in range(SEARCH_STEPS):
         trace = inject_square(drive, quick, axis, plan.half_periods[0], amplitude, SEARCH_SAMPLES, (f"i_{axis}_a",))

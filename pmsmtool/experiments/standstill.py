@@ -11,11 +11,13 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.drive.standard_drive import StandardDrive
-from pmsmtool.experiments.rotation import TURN_S, come_to_rest, lead_onto_vector, turn_vector
+from pmsmtool.experiments.rotation import SWUNG_S, TURN_S, come_to_rest, lead_onto_vector, turn_vector
 from pmsmtool.experiments.signals import readable, table
 from pmsmtool.trace import Trace
 
@@ -71,6 +73,11 @@ NOISE_SAMPLES = 1024
 PHASE_ANGLES_RAD = (0.0, 2.0 * math.pi / 3.0, 4.0 * math.pi / 3.0)
 DC_ANGLE_RAD = math.pi / 2.0
 """One phase idle (docs/identification.md, 3.1)."""
+NEAR_ANGLES_RAD = (7.0 * math.pi / 6.0, 5.0 * math.pi / 6.0, DC_ANGLE_RAD)
+"""Vectors along the three pairs of phases that end on the first level's: a rotor that has half as far to go swings half
+as long, and no turn follows."""
+PAIR_STEP_RAD = math.pi / 3.0
+"""Angle from pair to pair of phases."""
 
 MEANS = ("u_d_v", "i_d_a", "u_q_v", "i_q_a", "T_winding_c", "U_dc_v")
 """What is averaged over a whole window at each level; with angle and flags the eight that a drive averages at once."""
@@ -122,7 +129,8 @@ class LevelPlan:
         Time of a turn of the vector, of the waits alone (s).
     quick : bool
         Whether every change of sign turns the vector on instead of back, so that the rests show the pole pairs; a rotor
-        that stands where it stood before the current changed is at rest then without a second look, and a swing braked.
+        that stands where it stood before the current changed is at rest then without a second look, and a swing braked;
+        and windows are as short as asked where the link is steady.
     """
 
     levels_a: Sequence[float]
@@ -139,6 +147,28 @@ class LevelPlan:
 def half_window(window_periods: int, period_s: float) -> int:
     """Return the control periods of half a window: about half of so many, and a whole multiple of ``RIPPLE_S``."""
     return round(max(1, round(0.5 * window_periods * period_s / RIPPLE_S)) * RIPPLE_S / period_s)
+
+
+LINK_ROWS, LINK_S = 60, 0.03
+"""Rows and time of a look at the link: three periods of 100 Hz."""
+LINK_STEADY = 5e-4
+"""Ripple of the link (peak, relative) below which a window may end within a period of it: its mean is a tenth of that
+off, of the error that a dead time makes."""
+STEADY_HALF_S = 0.02
+"""Shortest half of a window on a steady link: three time constants of the current's loop."""
+
+
+def steady_half(drive: Drive, window_periods: int) -> int | None:
+    """Return the control periods of half a window on a DC link without ripple; None where it ripples.
+
+    Noise is no ripple: it differs from row to row.
+    """
+    decimation = max(1, round(LINK_S / (LINK_ROWS * drive.period_s)))
+    link = drive.record(("U_dc_v",), LINK_ROWS, decimation=decimation)["U_dc_v"]
+    slow = float(np.var(link)) - 0.5 * float(np.mean(np.diff(link) ** 2))
+    if math.sqrt(max(0.0, 2.0 * slow)) > LINK_STEADY * float(np.mean(link)):
+        return None
+    return round(max(0.5 * window_periods, STEADY_HALF_S / drive.period_s))
 
 
 ARRIVAL_LIMIT_S = 1.0
@@ -163,6 +193,19 @@ def calm_sequence(magnitudes: Sequence[float], low: Sequence[float] = ()) -> tup
     return (*_there_and_back(up[::2]), *turn, *minus, *_there_and_back(up[1::2]))
 
 
+def falling_sequence(magnitudes: Sequence[float], low: Sequence[float] = ()) -> tuple[float, ...]:
+    """Return an order of levels (A) on which a free rotor rests soon: all of plus, then of minus, falling.
+
+    The rotor is turned over once, and on levels that fall friction holds it where it stands. A drift is even in the
+    sign then, and stays orthogonal to the slope. The first ones of each sign rise, two below the largest: a step to it
+    takes a weak supply to its under-voltage, and a limit shows below. ``low`` are held, too.
+    """
+    down = sorted((*magnitudes, *low), reverse=True)
+    rise = down[4:0:-2]
+    plus = (*rise, *(level for level in down if level not in rise))
+    return (*plus, *(-level for level in plus))
+
+
 def _there_and_back(up: Sequence[float]) -> tuple[float, ...]:
     return (*up[::2], *reversed(up[1::2]))
 
@@ -176,22 +219,27 @@ PERIODS = 512
 """Of the means of one vector, in two halves."""
 
 
-def hold_phase_vectors(drive: Drive, i_a: float) -> Trace:
-    """Hold a small vector at 0, 120 and 240 degrees and return one row of means for each.
+def hold_phase_vectors(drive: Drive, i_a: float, angles_rad: Sequence[float] = PHASE_ANGLES_RAD) -> Trace:
+    """Hold a small vector along each phase's axis and return one row of means for each.
 
     The drive is enabled on entry and holds zero current on return. It is off between two vectors: what its controller
-    has wound up against an open phase must not meet the other two.
+    has wound up against an open phase must not meet the other two. Along :data:`NEAR_ANGLES_RAD` the rotor swings from
+    one to the next, and the rows show vector and encoder, too.
     """
     names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
     rows: list[dict[str, float]] = []
     times = []
     elapsed = 0.0
-    for angle in PHASE_ANGLES_RAD:
+    near, last = angles_rad == NEAR_ANGLES_RAD, angles_rad[0]
+    for angle in angles_rad:
         if rows:
             drive.disable()
             drive.enable()
-        drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
         begun, before = elapsed, math.inf
+        if rows and near:
+            elapsed += turn_vector(drive, i_a, last, angle, SWUNG_S)
+        last = angle
+        drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
         while True:
             elapsed += settle(drive, i_a, arrival_s=ARRIVAL_LIMIT_S)
             first, second, _ = drive.halves(names, PERIODS // 2)
@@ -204,9 +252,10 @@ def hold_phase_vectors(drive: Drive, i_a: float) -> Trace:
             before = second["theta_m_rad"]
         times.append(elapsed)
         row = {name: 0.5 * (first[name] + second[name]) for name in names if name != "theta_m_rad"}
-        rows.append({**row, "moved": float(moved)})
-    drive.command_current(0.0, 0.0, fixed_angle_rad=PHASE_ANGLES_RAD[-1])
-    return table(rows, times, i_command_a=i_a, angles_rad=list(PHASE_ANGLES_RAD))
+        shown = {"theta_imposed_rad": angle, "theta_M_rad": second["theta_m_rad"]}
+        rows.append({**row, "moved": float(moved), **(shown if near else {})})
+    drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
+    return table(rows, times, i_command_a=i_a, angles_rad=list(angles_rad))
 
 
 PAIR_SHARES = (0.15, 0.30)
@@ -217,9 +266,16 @@ time the controller of the parameter set is slow, and 2 % below its set-point it
 
 
 def hold_pairs(
-    drive: Drive, i_a: float, turn_a: float, start_rad: float, turn_s: float = TURN_S, *, quick: bool = False
+    drive: Drive,
+    i_a: float,
+    turn_a: float,
+    start_rad: float,
+    turn_s: float = TURN_S,
+    *,
+    quick: bool = False,
+    half: int | None = None,
 ) -> Trace:
-    """Hold two currents through each pair of phases, the third phase idle; return one row of means for each.
+    """Hold two currents through each pair of phases, the third phase idle (``meta["idle"]``); return a row for each.
 
     The windows are whole periods of a link's ripple, and how far their halves differ is kept, too: of 15 ms on a ripple
     of 3.6 % the slopes of equal phases were 1.8 % apart.
@@ -234,30 +290,37 @@ def hold_pairs(
         Current that turns the rotor from pair to pair (A peak), the vector that was held last (rad electrical), and the
         time of a turn (s).
     quick : bool
-        Whether the rows also have the angles of vector and encoder, and a swing is braked.
+        Whether the rows also have the angles of vector and encoder, the vector goes on by 60 degrees from pair to pair,
+        and a swing is braked.
+    half : int or None
+        Control periods of half a window; None: whole periods of a link's ripple.
     """
     names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
-    half = half_window(PERIODS, drive.period_s)
+    half = half or half_window(PERIODS, drive.period_s)
     rows: list[dict[str, float]] = []
     times: list[float] = []
     elapsed = 0.0
     angle = start_rad
     whole = 2.0 * math.pi * round((start_rad - DC_ANGLE_RAD) / (2.0 * math.pi))
-    for k in range(3):
-        target = whole + DC_ANGLE_RAD + PHASE_ANGLES_RAD[k]
+    targets = [whole + DC_ANGLE_RAD + further for further in PHASE_ANGLES_RAD]
+    if quick:
+        targets = [start_rad + k * PAIR_STEP_RAD for k in range(3)]
+    for target in targets:
         if target != angle:
             elapsed += turn_vector(drive, turn_a, angle, target, turn_s)
             angle = target
-        for share in PAIR_SHARES:
+        stood = math.inf
+        for share in sorted(PAIR_SHARES, reverse=quick):  # on the larger a swing is short, and friction holds it then
             drive.command_current(share * i_a, 0.0, fixed_angle_rad=angle)
-            for _ in range(TRIES):
-                elapsed += settle(drive, share * i_a)
+            for n in range(TRIES):
+                elapsed += settle(drive, share * i_a, stood_rad=stood)
                 first, second, samples = drive.halves(names, half)
                 moved = abs(second["theta_m_rad"] - first["theta_m_rad"]) >= REST_RAD
                 missed = max(abs(part["i_d_a"] - share * i_a) for part in (first, second))
+                stood = second["theta_m_rad"] if quick else math.inf
                 if not moved and missed <= PAIR_ARRIVED * share * i_a:
                     break
-                if quick and moved:
+                if quick and n > 1 and moved:
                     elapsed += brake(drive, PAIR_SHARES[-1] * i_a, share * i_a, angle)
                     turn_s = SWINGING_TURN_S
             times[len(rows) :] = [elapsed]
@@ -267,7 +330,8 @@ def hold_pairs(
             rows.append({**row, "moved": float(moved), **shown})
             elapsed += 2 * half * drive.period_s
     drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
-    return table(rows, times, samples=samples, i_command_a=i_a, idle=["a", "a", "b", "b", "c", "c"])
+    idle = ["acb"[round((target - DC_ANGLE_RAD) / PAIR_STEP_RAD) % 3] for target in targets for _ in PAIR_SHARES]
+    return table(rows, times, samples=samples, i_command_a=i_a, idle=idle)
 
 
 def turn_and_look(drive: Drive, i_a: float, start_rad: float, end_rad: float, turn_s: float = TURN_S) -> Trace:
@@ -337,7 +401,7 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
     rows: list[dict[str, float]] = []
     times: list[float] = []
     elapsed = 0.0
-    angle, stood, turn_s = plan.start_rad, math.inf, plan.turn_s
+    angle, stood, turn_s, looked = plan.start_rad, math.inf, plan.turn_s, not plan.quick
     for level in plan.levels_a:
         sign = math.copysign(1.0, level)
         target = plan.angle_rad if sign > 0.0 else plan.angle_rad + math.pi
@@ -350,8 +414,10 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
         drive.command_current(abs(level), 0.0, fixed_angle_rad=angle)
         drive.wait(plan.settle_s)
         elapsed += plan.settle_s
-        for _ in range(TRIES):
+        for k in range(TRIES):
             elapsed += settle(drive, abs(level), near_a=NEAR_SHARE * largest, stood_rad=stood)
+            if not looked and abs(level) == largest:  # under which a supply gives way
+                half, looked = steady_half(drive, plan.window_periods) or half, True
             first, second, samples = drive.halves(names, half)
             times[len(rows) :] = [elapsed]
             elapsed += 2 * half * drive.period_s
@@ -365,7 +431,7 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
                 stood = second["theta_m_rad"]
             if not moved:
                 break
-            if plan.quick and turned >= REST_RAD:
+            if plan.quick and k > 1 and turned >= REST_RAD:
                 elapsed += brake(drive, largest, abs(level), angle)
                 turn_s = SWINGING_TURN_S
         row = {name: 0.5 * (first[name] + second[name]) for name in MEANS}

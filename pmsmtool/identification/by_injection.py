@@ -25,6 +25,7 @@ from pmsmtool.identification.request import (
     accuracy_facts,
     accuracy_line,
     dump_request,
+    left_out_of,
     place_of,
     refused_in,
     stored_traces,
@@ -73,7 +74,9 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         files = {f"{prefix}{name}": "" for name in (MACHINE, *made)}
     files |= {name: "" for name in (PREDICTED, REFUSED) if (run.path / name).is_file()}
     fallen = [f"{name}: {estimate.fallback}" for name, estimate in found.items() if estimate.fallback]
-    accuracy = accuracy_facts(request.accuracy, request.quantities, found)
+    left_out = left_out_of(run)
+    told = ", ".join(f"{what} ({name})" for name, what in left_out.items())
+    accuracy = accuracy_facts(request.accuracy, request.quantities, found, left_out)
     missed = not all(fact["reached"] for fact in accuracy.values())
     bend_per_a = conditions.get("L_d_bend_per_a")
     facts = [
@@ -97,7 +100,11 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
         fallbacks=[*verdicts.lines(), *verdicts_of(unasked, evaluation.refused, had, acceptance).lines(), *fallen],
         files={**files, NAMEPLATE: "", REQUEST: "", **{f"traces/{path.name}": "" for path in trace_files(run)}},
         note="; ".join(
-            [*([accuracy_line(accuracy)] if missed else []), *value_verdict.warnings_of(evaluation, request)]
+            [
+                *([accuracy_line(accuracy)] if missed else []),
+                *([f"left out for the accuracy asked: {told}"] if left_out else []),
+                *value_verdict.warnings_of(evaluation, request),
+            ]
         ),
         summary="; ".join(filter(None, (summary, *(f"{name} refused" for name in verdicts.refused)))),
         refused=dict(verdicts.refused),

@@ -177,7 +177,7 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
     Parameters
     ----------
     pairs : Trace
-        Six rows, two currents with phase a, b and c idle in turn: ``i_a_a i_b_a i_c_a u_d_v i_d_a`` (means),
+        Six rows, two currents with each phase idle (``meta["idle"]``, else a, b, c): ``i_a_a i_b_a i_c_a u_d_v i_d_a``,
         ``moved`` 1 where the rotor did not come to rest; ``u_d_change_v i_d_change_a`` from half to half of a window,
         and ``meta["samples"]``, where they are known.
     noise : Noise
@@ -197,7 +197,8 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
         )
     # the other two phases of a pair have half of the idle one's gain less, beyond the mean
     gains = np.array(mismatch.gains) if mismatch.corrected else np.zeros(3)
-    i, u = pairs["i_d_a"] / (1.0 - 0.5 * np.repeat(gains, 2)), pairs["u_d_v"]
+    order = np.argsort(pairs.meta.get("idle", list("aabbcc")), kind="stable")
+    i, u = pairs["i_d_a"][order] / (1.0 - 0.5 * np.repeat(gains, 2)), pairs["u_d_v"][order]
     lost = curve.error_v(math.sqrt(3.0) / 2.0 * i) * 2.0 / math.sqrt(3.0)
     steps = np.diff(i)[::2]
     raw = np.diff(u)[::2] / steps

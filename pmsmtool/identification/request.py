@@ -52,6 +52,17 @@ def entry(before: str, relative_std: Mapping[str, float], **more: object) -> dic
     return {"before": before, "relative_std": dict(relative_std), **more}
 
 
+LEFT_OUT = "left_out"
+"""Field of an entry: what is not collected for an accuracy, by quantity; the last one counts."""
+
+
+def left_out_of(run: RunDirectory) -> dict[str, str]:
+    """Return what a run did not collect because an accuracy was asked for, by quantity."""
+    path = run.path / PREDICTED
+    entries = json.loads(path.read_text(encoding="utf-8"))["predictions"] if path.is_file() else []
+    return next((entry[LEFT_OUT] for entry in reversed(entries) if LEFT_OUT in entry), {})
+
+
 def dump_predicted(entries: list[dict[str, Any]]) -> str:
     """Return the file's text."""
     return json.dumps({"schema": SCHEMA, "predictions": entries}, indent=1) + "\n"
@@ -120,9 +131,11 @@ KEYS: Mapping[str, tuple[str, ...]] = {"R": ("R_s_ohm",), "L": ("L_d_h", "L_q_h"
 
 
 def accuracy_facts(
-    asked: float | None, quantities: Iterable[str], found: Mapping[str, Estimate]
+    asked: float | None, quantities: Iterable[str], found: Mapping[str, Estimate], left_out: Mapping[str, str]
 ) -> dict[str, dict[str, Any]]:
     """Return for every value that was asked for its half width (None: no value) and whether it is small enough.
+
+    And what was left out for that, where anything was.
 
     Parameters
     ----------
@@ -132,16 +145,19 @@ def accuracy_facts(
         What was asked for, ``R L psi ...``.
     found : mapping of str to Estimate
         By machine-file key.
+    left_out : mapping of str to str
+        As :func:`left_out_of`.
     """
     if asked is None:
         return {}
-    facts = {}
-    for key in (key for quantity in quantities for key in KEYS.get(quantity, ())):
+    facts: dict[str, dict[str, Any]] = {}
+    for key, quantity in ((key, name) for name in quantities for key in KEYS.get(name, ())):
         estimate = found.get(key)
         half = None
         if estimate is not None and estimate.value:
             half = statistical_half_width(estimate) / abs(estimate.value)
         facts[key] = {"asked": asked, "statistical_95": half, "reached": half is not None and half <= asked}
+        facts[key] |= {LEFT_OUT: left_out[quantity]} if quantity in left_out else {}
     return facts
 
 

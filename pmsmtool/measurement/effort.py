@@ -2,14 +2,14 @@
 """How much is collected for an accuracy that was asked for: levels, windows, shots and speeds, by what they predict.
 
 Without one everything is collected. The short lists begin with what the estimators need at least: both signs and five
-levels above their least one, two half periods, five pairs of d currents over two speeds in each direction, three of
+levels above their least one, two half periods, four pairs of d currents over two speeds in each direction, three of
 them with the largest, which show the sampling instant.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
@@ -53,10 +53,20 @@ class LevelEffort:
         magnitudes[:2] = [largest_a * LOWEST_LEVEL, largest_a * LOWEST_LEVEL * ratio]
         return sorted(set(magnitudes))
 
+    def sequence(self, largest_a: float, low_a: Sequence[float] = ()) -> tuple[float, ...]:
+        """Return the levels with their signs (A), in the order in which they are held; ``low_a`` besides."""
+        order = standstill.calm_sequence if self.shares is None else standstill.falling_sequence
+        return order(self.magnitudes(largest_a), low_a)
+
 
 @dataclass(frozen=True, slots=True)
 class SpeedEffort:
-    """Speeds and d currents of the flux run (``speed_run.SpeedPlan``), and rows of the pushes before and after it."""
+    """Speeds and d currents of the flux run (``speed_run.SpeedPlan``), and rows of the pushes before and after it.
+
+    ``speed_share`` is its largest speed, of the largest; ``answer_samples`` are those of a push that looks for the
+    shaft's answer, which is one from ``answer_share`` of the speed that the pushes aim at. ``quick`` runs have more
+    accelerating current, shorter looks at the speed and fewer at what keeps it.
+    """
 
     shares: tuple[float, ...] = speed_run.SHARES
     d_shares: tuple[tuple[float, ...], ...] = speed_run.D_SHARES
@@ -64,7 +74,10 @@ class SpeedEffort:
     window_s: float = speed_run.WINDOW_S
     push_samples: int = 1024
     mechanics_rows: int = mechanics_run.ROWS
-    quick_ramps: bool = False
+    speed_share: float = 1.0
+    answer_samples: int = 256
+    answer_share: float = 0.15
+    quick: bool = False
 
 
 ALL_SPEEDS = SpeedEffort()
@@ -76,31 +89,48 @@ class Effort:
     """What is collected; the default is all of it. ``rotations`` are tried before the usual slow turns.
 
     With ``quick`` pole pairs, direction and offset come from the rotor's rests on the vectors of levels and pairs,
-    where these show them, without the slow turn; levels, pairs and square waves are held as ``quick`` ones.
+    where these show them, without the slow turn; levels, pairs and square waves are held as ``quick`` ones. The rotor
+    is turned by ``turn_share`` of the test current at least.
     """
 
     levels: LevelEffort = ALL_LEVELS
     turn_s: float = rotation.TURN_S
+    turn_share: float = 0.0
     quick: bool = False
     rotations: tuple[Rotation, ...] = ()
     shot_samples: int = square_injection.SHOT_SAMPLES
     speeds: SpeedEffort = ALL_SPEEDS
 
+    @property
+    def left_out(self) -> dict[str, str]:
+        """What is not collected, by quantity of a request."""
+        found = {}
+        if self.levels != ALL_LEVELS:
+            held, all_of = (2 * (len(one.magnitudes(1.0)) + len(one.low)) for one in (self.levels, ALL_LEVELS))
+            found["R"] = f"{all_of - held} of {all_of} levels"
+        if self.shot_samples != square_injection.SHOT_SAMPLES:
+            all_of = square_injection.SHOT_SAMPLES
+            found["L"] = f"up to {all_of - self.shot_samples} of {all_of} samples of a square wave"
+        if self.speeds != ALL_SPEEDS:
+            share, all_of = self.speeds.speed_share, len(speed_run.SHARES)
+            slower = f", down to {100.0 * share:.0f} % of the largest speed" if share < 1.0 else ""
+            found["psi"] = f"{all_of - len(self.speeds.shares)} of {all_of} speeds in each direction{slower}"
+        return found
+
 
 ALL = Effort()
 LEVEL_EFFORTS = (
-    LevelEffort((0.08, 0.16, 0.3, 0.42, 0.6, 0.8, 1.0), (0.03,), 400, 4.0 * standstill.DRIFTED, 0.03),
+    LevelEffort((0.08, 0.16, 0.3, 0.42, 0.6, 0.8, 1.0), (0.03,), 400, 4.0 * standstill.DRIFTED, 0.0),
     LevelEffort((0.08, 0.12, 0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0), (0.02, 0.04), 800, 2.0 * standstill.DRIFTED),
     ALL_LEVELS,
 )
 SHOT_EFFORTS = (256, 512, 1024, square_injection.SHOT_SAMPLES)
-SPEED_EFFORTS = (
-    SpeedEffort((0.42, 0.85), ((1.0, 1.0), (1.0 / 3.0, 2.0 / 3.0, 1.0)), (0,), 0.04, 256, 800, True),
-    ALL_SPEEDS,
-)
+_TWO_SPEEDS = SpeedEffort((0.42, 0.85), ((1.0,), (1.0 / 3.0, 1.0, 1.0)), (0,), 0.04, 256, 800, 1.0, 64, 0.05, True)
+SPEED_EFFORTS = (replace(_TWO_SPEEDS, speed_share=0.5), _TWO_SPEEDS, ALL_SPEEDS)
 QUICK_NOISE_SAMPLES = 400
 """The noise is known to 2.5 % of itself."""
-QUICK_TURN_S = 0.4
+QUICK_TURN_SHARE = 0.3
+"""Current that swings the rotor from vector to vector, of the test current: that of the pairs of phases."""
 QUICK_ROTATION: Rotation = (0.35, math.radians(30.0), rotation.QUICK_DWELL_S, 0.35)
 """Current, step, dwell and ramp of a slow turn that is tried first (``measure.ROTATIONS``): what swings with it takes
 those. It serves pole pairs and direction; the offset comes from the speed run."""
@@ -129,8 +159,10 @@ def effort_for(accuracy: float | None, predicted: Callable[[Effort], Prediction]
     shots = next(
         (one for one in SHOT_EFFORTS if enough(predicted(Effort(shot_samples=one)).L, L_MISFIT)), SHOT_EFFORTS[-1]
     )
-    speeds = SPEED_EFFORTS[0 if enough(predicted(ALL).psi_f, PSI_MISFIT) else -1]
-    return Effort(levels, QUICK_TURN_S, True, (QUICK_ROTATION,), shots, speeds)
+    speeds = next(
+        (one for one in SPEED_EFFORTS if enough(predicted(Effort(speeds=one)).psi_f, PSI_MISFIT)), SPEED_EFFORTS[-1]
+    )
+    return Effort(levels, rotation.SWUNG_S, QUICK_TURN_SHARE, True, (QUICK_ROTATION,), shots, speeds)
 
 
 def coasting_for(

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 from pmsmtool.drive.port import Drive
@@ -39,11 +39,11 @@ from pmsmtool.experiments.current_limit import (
 )
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
-from pmsmtool.experiments.rotation import RAMP_S, come_to_rest, turn_vector
+from pmsmtool.experiments.rotation import RAMP_S, turn_vector
 from pmsmtool.identification.evaluate import Evaluation, evaluate, flux_of, inductance_of, resistance_of, tolerance_on
 from pmsmtool.identification.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
-from pmsmtool.identification.request import entry, steps_of
+from pmsmtool.identification.request import LEFT_OUT, entry, steps_of
 from pmsmtool.identification.value_verdict import BEND_NOTED
 from pmsmtool.identification.wiring import supply_power
 from pmsmtool.machine.parameters import Estimate
@@ -84,8 +84,6 @@ of the saturated profile, below 0.0035 of linear drives, 0.007 to 0.02 beside 5 
 BESIDE_RAD = math.radians(15.0)
 """Angle by which the offset of the largest current may differ from that of a rotor that jumps with a smaller one; seen
 0 to 2.4 deg, and 43 deg where reluctance turns the rotor off its vector."""
-ONTO_ZERO_S = 0.2
-"""Turn of the vector from the last pair to zero, with the bias of the square waves, which stands there: 30 degrees."""
 OFF_THE_VECTOR = ("E_ROTOR_MOVED", "E_POLE_PAIRS")
 RIPPLE_SHARE = 0.25
 
@@ -177,7 +175,7 @@ class Measurement:
         phases = self._phase_check(noise)
         self._predict(noise, phases, steps)
         self._tell_spent()
-        start = standstill.PHASE_ANGLES_RAD[-1]
+        start = self._phase_angles[-1]
         if "rotation" in steps:
             self._encoder_counts(start, standstill.DC_ANGLE_RAD)
             start = standstill.DC_ANGLE_RAD
@@ -228,10 +226,11 @@ class Measurement:
         )
 
         def enough() -> bool:
-            try:
-                return self._within(self._flux(resistance).psi_f) or self._computed(self._within_sampled)
-            except IdentificationError:
-                return False
+            with contextlib.suppress(IdentificationError):
+                if self._within(self._flux(resistance).psi_f) or self._computed(self._within_sampled):
+                    return True
+            self._leave_out(replace(self._effort, speeds=ALL.speeds))
+            return False
 
         plan = self._attempt("psi", lambda: speeds.measure(resistance, encoder, inductances, enough))
         ran = plan is not None
@@ -314,6 +313,8 @@ class Measurement:
         """Run what measures the shaft, and say before each how well."""
         forecast = self._computed(lambda: self._forecast(noise, resistance, encoder))
         if "coasting" in steps:
+            effort = self._effort
+            look_s = speed_run.QUICK_LOOK_S if effort.quick else speed_run.LOOK_S
             values: dict[str, float] = {}
 
             def chosen(plan: MechanicsPlan) -> MechanicsPlan:
@@ -331,7 +332,7 @@ class Measurement:
             self._attempt(
                 "mechanics",
                 lambda: mechanics.measure_mechanics(
-                    self.drive, self.limits, self.keep, self.say, chosen, planned, self._effort.speeds.mechanics_rows
+                    self.drive, self.limits, self.keep, self.say, chosen, planned, effort.speeds.mechanics_rows, look_s
                 ),
             )
             self._tell_spent()
@@ -410,34 +411,44 @@ class Measurement:
         def predicted(effort: Effort) -> Prediction:
             return predict(
                 noise,
-                standstill.calm_sequence(effort.levels.magnitudes(limits.I_test_apk)),
+                effort.levels.sequence(limits.I_test_apk),
                 effort.levels.window,
                 self.ripple_share * limits.I_test_apk,
                 2 * effort.shot_samples,
                 dead_time_v,
-                EMF_SHARE * limits.V_max_v * speed_run.SHARES[1],
+                EMF_SHARE * effort.speeds.speed_share * limits.V_max_v * speed_run.SHARES[1],
                 self._tolerance(),
             )
 
         self._effort = effort_for(self.accuracy, predicted)
-        prediction = predicted(self._effort)
-        values = prediction.values(steps)
+        values = predicted(self._effort).values(steps)
         self.say(line_of(values))
         later = mechanics.later_line(steps)
         if later:
             self.say(later)
         self._tell(entry("levels", values, later=[what for step, what in mechanics.LATER.items() if step in steps]))
+        self._leave_out(self._effort)
         check_prediction(values)
+
+    def _leave_out(self, effort: Effort) -> None:
+        """Take an effort as what is collected, and tell what it leaves out."""
+        self._effort, self.turn_share = effort, max(self.turn_share, effort.turn_share)
+        if self.accuracy is not None:
+            self._tell(entry("", {}, **{LEFT_OUT: effort.left_out}))
+
+    @property
+    def _phase_angles(self) -> tuple[float, ...]:
+        return standstill.PHASE_ANGLES_RAD if self.accuracy is None else standstill.NEAR_ANGLES_RAD
 
     def _phase_check(self, noise: Noise) -> PhaseCheck:
         i_a = PHASE_CHECK_SHARE * self.limits.I_test_apk
         self.say(f"phases: three vectors of {i_a:.3g} A")
         self.drive.enable()
-        trace = standstill.hold_phase_vectors(self.drive, i_a)
-        self.keep("phase_vectors", trace)
+        trace = standstill.hold_phase_vectors(self.drive, i_a, self._phase_angles)
+        self._keep_for_later("phase_vectors", trace)
         found = check_phases(trace, noise)
         if self.limit_current is not None:
-            limits, angle = self.limits, standstill.PHASE_ANGLES_RAD[-1]
+            limits, angle = self.limits, self._phase_angles[-1]
             shown = show_current_limit(self.drive, self.limit_current, limits.I_nom_apk, limits.i_max_apk, angle)
             self.say(f"  {shown or not_shown()}")
             require_limit(shown)
@@ -447,25 +458,28 @@ class Measurement:
     def _speed_limit(self, largest_rad_s: float, pole_pairs: int) -> None:
         """Show that the drive keeps its own speed limit, before the run that relies on it."""
         if self.limit_speed is not None:
-            shown = show_speed_limit(self.drive, self.limit_speed, largest_rad_s, pole_pairs)
+            quick = self._effort.quick
+            shown = show_speed_limit(self.drive, self.limit_speed, largest_rad_s, pole_pairs, quick=quick)
             self.say(f"  {shown or not_shown('speed')}")
             require_limit(shown)
             self.unproven += filter(None, [unproven(shown, "speed")])
             self.limit_speed = None  # once is enough
 
     def _encoder_counts(self, start_rad: float, end_rad: float) -> None:
+        if self._effort.quick:
+            with contextlib.suppress(IdentificationError):  # the rotor follows the vectors of the phases already
+                check_encoder_counts(self._kept["phase_vectors"])
+                return
+            start_rad = self._phase_angles[0]
         for share in TURN_SHARES:
-            self.turn_share = share
+            self.turn_share = max(share, self._effort.turn_share)
             current = share * self.limits.I_test_apk
             trace = standstill.turn_and_look(self.drive, current, start_rad, end_rad, self._effort.turn_s)
-            try:
+            with contextlib.suppress(IdentificationError):
                 check_encoder_counts(trace)
                 break
-            except IdentificationError:
-                if share == TURN_SHARES[-1]:
-                    self.keep("first_turn", trace)
-                    raise
         self.keep("first_turn", trace)
+        check_encoder_counts(trace)
 
     def _levels(self, noise: Noise, start_rad: float) -> ResistanceResult:
         """Hold levels; a sweep of less effort that is refused, or not as good as was asked, is followed by the next."""
@@ -474,11 +488,12 @@ class Measurement:
             plan = self._level_plan(effort, start_rad)
             self.say(f"R and inverter: {len(plan.levels_a)} levels up to {self.limits.I_test_apk:.3g} A")
             trace = standstill.hold_levels(self.drive, plan)
-            start_rad = plan.angle_rad  # the last level is positive
+            start_rad = float(trace.signals.get("theta_imposed_rad", [plan.angle_rad])[-1])
             self._keep_for_later("levels", trace)
             if effort is efforts[-1] or self._enough_levels(trace, noise):
                 break
             self.say("  the accuracy asked for is not reached: more levels")
+            self._leave_out(replace(self._effort, levels=efforts[-1]))
             self._spare_supply()  # the winding is warmer by now: what the link just bore can trip it
         return resistance_of(trace, noise)
 
@@ -493,7 +508,7 @@ class Measurement:
     def _level_plan(self, effort: LevelEffort, start_rad: float) -> standstill.LevelPlan:
         largest = self.limits.I_test_apk
         return standstill.LevelPlan(
-            standstill.calm_sequence(effort.magnitudes(largest), [largest * share for share in effort.low]),
+            effort.sequence(largest, [largest * share for share in effort.low]),
             turn_a=self.turn_share * largest,
             start_rad=start_rad,
             window_periods=effort.window,
@@ -523,10 +538,11 @@ class Measurement:
         self.say(f"pairs of phases: two currents up to {strongest:.3g} A through each")
         turn_a, turn_s, quick = self.turn_share * largest, self._effort.turn_s, self._effort.quick
         start = float(self._kept["levels"]["theta_imposed_rad"][-1]) if quick else standstill.DC_ANGLE_RAD
-        pairs = standstill.hold_pairs(self.drive, largest, turn_a, start, turn_s, quick=quick)
+        half = int(self._kept["levels"].meta["samples"]) // 2 if quick else None
+        pairs = standstill.hold_pairs(self.drive, largest, turn_a, start, turn_s, quick=quick, half=half)
         self._keep_for_later("phase_pairs", pairs)
         check_pairs(pairs, noise, resistance.curve)
-        return start + standstill.PHASE_ANGLES_RAD[-1]
+        return start + (2.0 * standstill.PAIR_STEP_RAD if quick else standstill.PHASE_ANGLES_RAD[-1])
 
     def _encoder(self, start_rad: float) -> EncoderResult:
         """Take the rests for pole pairs, direction and offset, or turn slowly; the rotor is left near angle zero."""
@@ -537,11 +553,9 @@ class Measurement:
                 self.say(f"  {refusal.what}: the shaft is turned")
             else:
                 self.say("pole pairs, direction, offset: from the rests on the vectors")
-                end = 2.0 * math.pi * math.ceil(start_rad / (2.0 * math.pi))
-                bias_a = BIAS_SHARE * self.limits.I_test_apk
-                turn_vector(self.drive, bias_a, start_rad, end, ONTO_ZERO_S)
-                come_to_rest(self.drive, bias_a, end)
-                return found
+                end = 2.0 * math.pi * round(start_rad / (2.0 * math.pi))
+                turn_vector(self.drive, BIAS_SHARE * self.limits.I_test_apk, start_rad, end, self._effort.turn_s)
+                return found  # the bias of the square waves waits for the rotor
         return self._rotation(start_rad)
 
     def _rotation(self, start_rad: float) -> EncoderResult:

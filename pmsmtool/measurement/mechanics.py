@@ -213,11 +213,12 @@ def measure_mechanics(
     chosen: Callable[[MechanicsPlan], MechanicsPlan] = lambda plan: plan,
     planned: Callable[[], None] = lambda: None,
     rows: int = mechanics_run.ROWS,
+    look_s: float = speed_run.LOOK_S,
 ) -> None:
     """Run the steps; the drive holds current gains, flux linkage and rough inertia of the runs before.
 
     ``chosen`` returns what is run of a plan, and ``planned`` is called before anything of it moves the shaft; ``rows``
-    is the largest number per push.
+    is the largest number per push, ``look_s`` the time of a look at the speed.
     """
     pole_pairs = drive.read("motor.pole_pairs")
     psi, J, L_q = (drive.read(f"motor.{name}") for name in ("psi_f_wb", "J_kgm2", "L_q_h"))
@@ -232,12 +233,12 @@ def measure_mechanics(
         f"coasting with the voltage off, {plan.duration_s:.2g} s"
     )
     planned()
-    _come_to_rest(drive, pole_pairs * plan.omega_rad_s)
+    _come_to_rest(drive, pole_pairs * plan.omega_rad_s, look_s)
     keep_part = numbered(drive, TRACE, keep)
     abort = ABORT_SHARE * pole_pairs * limits.omega_max_rad_s
     mechanics_run.push_and_coast(drive, plan, abort, keep_part)
     drive.enable()
-    _come_to_rest(drive, pole_pairs * plan.omega_rad_s)
+    _come_to_rest(drive, pole_pairs * plan.omega_rad_s, look_s)
 
 
 def measure_cogging(
@@ -252,14 +253,14 @@ def measure_cogging(
     speed_run.reach(drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * pole_pairs * limits.omega_max_rad_s)
 
 
-def _come_to_rest(drive: Drive, reached_rad_s: float) -> None:
+def _come_to_rest(drive: Drive, reached_rad_s: float, look_s: float) -> None:
     """Stop the shaft by the speed controller, from the speed it has or that of the pushes (electrical)."""
     from_rad_s = max(reached_rad_s, abs(drive.live("omega_e_rad_s")))
     drive.command_speed(0.0)
     band = REST_SHARE * reached_rad_s
     rate = rad_s_from_rpm(drive.read("speed.acceleration_rpm_per_s")) * drive.read("motor.pole_pairs")
     ramp_s = min(speed_run.RAMP_MOST_S, speed_run.RAMP_DOUBT * from_rad_s / rate) if rate > 0.0 else 0.0
-    waited = speed_run.reach(drive, 0.0, limit_s=speed_run.REACH_LIMIT_S + ramp_s, band_rad_s=band)
+    waited = speed_run.reach(drive, 0.0, limit_s=speed_run.REACH_LIMIT_S + ramp_s, band_rad_s=band, look_s=look_s)
     if waited < speed_run.REACH_LIMIT_S + ramp_s:
         return
     drive.command_current(0.0, 0.0)  # a controller that shakes an elastic shaft never stops it, friction does

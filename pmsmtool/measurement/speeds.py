@@ -75,8 +75,10 @@ not come to rest before their inertia was measured, and a third used up the run'
 QUICK_RAMP_SHARE, TORQUE_OVER = 0.65, 1.6
 """Accelerating current where an accuracy is enough, and the speed controller's largest torque, of that of the ramp:
 together the test current. With 0.8 an elastic shaft took it past the envelope (seed 733104)."""
-REST_SHARE = 0.02
-"""Speed that counts as standstill, of the largest of the flux run."""
+SLOW_RUN_RAD_S = 2.0 * math.pi / 0.05
+"""Speed below which the flux run is not slowed down: a turn there is as long as a window."""
+REST_SHARE, QUICK_REST_SHARE = 0.02, 0.05
+"""Speed that counts as standstill, of the largest of the flux run; where the pulses wait for it once more."""
 
 
 def q_current_s(settle_s: float) -> float:
@@ -228,7 +230,7 @@ class SpeedStage:
         current, seconds = FIRST_SHARE * self.limits.I_test_apk, FIRST_S
         for _ in range(PUSHES_MOST):
             change, gained = self._there_and_back(current, seconds, pole_pairs)
-            if change > 0.15 * target:
+            if change > self.effort.answer_share * target:
                 times = SECOND_PUSH[0 if change < FAR * target else 1]
                 other, gained_then = self._there_and_back(times * current, seconds, pole_pairs)
                 # friction takes some of it, or nothing
@@ -249,9 +251,11 @@ class SpeedStage:
 
         The current is the one that flowed: a slow loop, or a dead time, lets it rise late.
         """
-        decimation = max(1, round(seconds / (256 * self.drive.period_s)))
+        samples = self.effort.answer_samples
+        decimation = max(1, round(seconds / (samples * self.drive.period_s)))
         push, _ = (
-            self._push(sign * i_q_a, 256, decimation, pole_pairs, speed_run.SHORT_PUSH_SIGNALS) for sign in (1.0, -1.0)
+            self._push(sign * i_q_a, samples, decimation, pole_pairs, speed_run.SHORT_PUSH_SIGNALS)
+            for sign in (1.0, -1.0)
         )
         return abs(_change(push["omega_e_rad_s"]) / pole_pairs), abs(_change(self._gained(push)[1]))
 
@@ -281,9 +285,11 @@ class SpeedStage:
         run_i_d = run_d_current(limits, L, self.drive.period_s)
         flux = psi + SATURATED * L[0] * run_i_d
         largest = min(limits.omega_max_rad_s / 1.1, EMF_SHARE * limits.V_max_v / (flux * pole_pairs))
+        # a slower run takes less time to its speeds, and more for the turns of its windows
+        largest = min(largest, max(self.effort.speed_share * largest, SLOW_RUN_RAD_S))
         # the accelerating current must leave voltage for itself: omega_e L_q i_q stands beside the back-emf
         i_most = REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L))
-        quick = self.effort.quick_ramps
+        quick = self.effort.quick
         i_run, largest = ramp_of(limits, largest, i_most, torque_per_ampere(pole_pairs, psi), J, quick=quick)
         per_ampere = torque_per_ampere(pole_pairs, psi) / J
         # a current that is slow because the inverter's error is steep would not be steady in its window
@@ -327,9 +333,11 @@ class SpeedStage:
             shares=self.effort.shares,
             d_shares=self.effort.d_shares,
             q_at=self.effort.q_at,
+            quick=quick,
         )
         rows = speed_run.coast_through(self.drive, plan, pole_pairs)
-        speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * largest * pole_pairs)
+        look_s, rest = (speed_run.QUICK_LOOK_S, QUICK_REST_SHARE) if quick else (speed_run.LOOK_S, REST_SHARE)
+        speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=rest * largest * pole_pairs, look_s=look_s)
         lag_s = 2.0 / self.drive.read("encoder.pll_bandwidth_rad_s")  # its poles are a double one
         facts = {"pole_pairs": pole_pairs, "U_dc_v": math.sqrt(3.0) * limits.V_max_v, "speed_lag_s": lag_s}
         facts["delay_periods"] = self.drive.read("inverter.delay_periods")

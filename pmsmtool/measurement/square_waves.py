@@ -16,7 +16,7 @@ from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES
 from pmsmtool.estimators.injection.inductance import MINIMUM_PERIODS, ROTOR_LIMIT_RAD, rotor_way
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import square_injection
-from pmsmtool.experiments.rotation import turn_vector
+from pmsmtool.experiments.rotation import SWUNG_S, turn_vector
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
@@ -114,8 +114,8 @@ def whole_periods(half_period: int) -> int:
 class SquareStage:
     """The shots on one drive, of so many samples; the other fields are those of ``measure.Measurement``.
 
-    With ``quick`` the leads at the first angle are those at the others, and a rotor near its vector at a further angle
-    is taken as it stands.
+    With ``quick`` the leads at the first angle are those at the others, a slow square wave takes the place of the
+    second, and a rotor near its vector at a further angle is taken as it stands.
     """
 
     drive: Drive
@@ -152,22 +152,33 @@ class SquareStage:
         for axis in axes:
             amplitude = square_injection.find_amplitude(self.drive, plan, axis, first_v)
             first_v = square_injection.NEXT_SHARE * amplitude
+            slow, last = 0, plan.half_periods[-1]
             for half_period in plan.half_periods:
-                samples = max(plan.samples, whole_periods(half_period))  # few samples are enough, few periods are not
-                shot = self._still(encoder, plan, axis, half_period, amplitude, samples)
-                self.keep(f"square_{axis}_{half_period}", shot)
-            found = square_injection.ripple_of(shot, axis)
-            last = plan.half_periods[-1]
-            rough.append(amplitude * last * self.drive.period_s / found)
-            slow = square_injection.slow_half_period(plan, self.drive.period_s, rough[-1] / resistance.R_measured.value)
+                if self.quick and slow:
+                    break  # two half periods are enough, and the slow one shows more
+                L = self._shot(encoder, plan, axis, half_period, amplitude)
+                slow = square_injection.slow_half_period(plan, self.drive.period_s, L / resistance.R_measured.value)
             if slow:
-                samples = max(plan.samples, whole_periods(slow))
-                shot = self._still(encoder, plan, axis, slow, amplitude * last / slow, samples)
-                self.keep(f"square_{axis}_{slow}", shot)
+                self._shot(encoder, plan, axis, slow, amplitude * last / slow)
+            rough.append(L)
             amplitudes[axis] = amplitude
         plan = self._further_angles(plan, encoder, knee, amplitudes)
         self.drive.command_current(0.0, 0.0, fixed_angle_rad=plan.angle_rad)
         return rough[0], rough[1]
+
+    def _shot(
+        self,
+        encoder: EncoderResult,
+        plan: square_injection.SquarePlan,
+        axis: square_injection.Axis,
+        half_period: int,
+        amplitude_v: float,
+    ) -> float:
+        """Record a shot of all samples; return the inductance (H) by its ripple."""
+        samples = max(plan.samples, whole_periods(half_period))  # few samples are enough, few periods are not
+        shot = self._still(encoder, plan, axis, half_period, amplitude_v, samples)
+        self.keep(f"square_{axis}_{half_period}", shot)
+        return amplitude_v * half_period * self.drive.period_s / square_injection.ripple_of(shot, axis)
 
     def _further_angles(
         self,
@@ -249,7 +260,7 @@ class SquareStage:
     def _turn(self, plan: square_injection.SquarePlan, start_rad: float, end_rad: float) -> None:
         """Turn the bias to an angle, and wait for it."""
         turn_s = max(FURTHER_TURN_S, QUARTER_TURN_S * abs(end_rad - start_rad) / (0.5 * math.pi))
-        turn_vector(self.drive, plan.bias_d_a, start_rad, end_rad, turn_s)
+        turn_vector(self.drive, plan.bias_d_a, start_rad, end_rad, SWUNG_S if self.quick else turn_s)
         square_injection.hold_bias(self.drive, replace(plan, angle_rad=end_rad))
 
     def _rotor(self, encoder: EncoderResult, vector_rad: float) -> float:

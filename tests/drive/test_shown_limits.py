@@ -103,24 +103,24 @@ def test_a_swinging_shaft_hides_no_limit_and_shows_none(
     assert LimitShown(3.17, 2.116, given, current_limit.MOST * 2.116).acts == (scale == 1.0)
 
 
-def speed_shown(rig: Rig, guard: GuardedDrive) -> LimitShown | None:
+def speed_shown(rig: Rig, guard: GuardedDrive, *, quick: bool = False) -> LimitShown | None:
     machine = load_machine_file(machine_path("interior-2k2"))
     J = machine.machine.J_kgm2 or 0.0
     loop = {"K_p_nms_per_rad": 50.0 * J, "K_i_nm_per_rad": 625.0 * J, "tau_max_nm": 3.0}
     loop["acceleration_rpm_per_s"] = 1500.0
     guard.write({**set_up_values(machine), **{f"speed.{name}": value for name, value in loop.items()}})
-    return show_speed_limit(guard, guard.limit_speed, ENVELOPE.speed_max_rad_s, POLE_PAIRS)
+    return show_speed_limit(guard, guard.limit_speed, ENVELOPE.speed_max_rad_s, POLE_PAIRS, quick=quick)
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize("name", ["full", "inject"])
-def test_the_speed_limit_is_shown_to_act(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "quick"), [("full", False), ("inject", False), ("full", True)])
+def test_the_speed_limit_is_shown_to_act(name: str, quick: bool, tmp_path: Path) -> None:
     """On every class that is commanded a speed; measured within 0.2 %."""
     with opened(name, tmp_path) as rig:
         before = rig.memory()
         with guarded(rig.drive, ENVELOPE) as guard:
             limit = rig.session.dictionary["cia402.max_speed"].number()
-            shown = speed_shown(rig, guard)
+            shown = speed_shown(rig, guard, quick=quick)
             assert rig.session.dictionary["cia402.max_speed"].number() == limit, "the envelope's holds again"
             assert not rig.energised
         assert shown is not None and shown.proven and "speed limit proven" in str(shown) and not unproven(shown)

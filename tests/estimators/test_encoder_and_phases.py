@@ -222,6 +222,17 @@ def pairs(R: tuple[float, float, float], gains: tuple[float, float, float] = (1.
 STEP = InverterCurve(np.array([1e-3, 10.0]), np.array([5.0, 5.0]), 0.0)
 
 
+def test_pairs_are_told_by_what_is_idle_in_whatever_order_they_were_held() -> None:
+    """A quick run holds a, c and b; with a tolerance of its sensors' gains, too."""
+    plain = pairs((2.06, 1.98, 1.96), gains=(1.0, 1.01, 1.0))
+    order = [0, 1, 4, 5, 2, 3]
+    held = replace(plain, signals={name: values[order] for name, values in plain.signals.items()})
+    held = replace(held, meta={**plain.meta, "idle": list("aaccbb")})
+    found, expected = (check_pairs(one, NOISE, STEP) for one in (held, plain))
+    assert found.resistance_ohm == pytest.approx(expected.resistance_ohm)
+    assert found.mismatch.gains == pytest.approx(expected.mismatch.gains)
+
+
 def test_equal_pairs_show_their_resistance_whatever_the_dead_time() -> None:
     result = check_pairs(pairs((2.0, 2.0, 2.0)), NOISE, STEP)
     assert result.resistance_ohm == pytest.approx((2.0, 2.0, 2.0))

@@ -44,8 +44,8 @@ from pmsmtool.run_directory import RunDirectory, Stage, new_record
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import read_trace
 
-MOST_S = 27.0
-"""Machine time of all default quantities of ``interior-2k2`` with 1 %; measured: 25.2 s, without an accuracy 46.5 s."""
+MOST_S = 19.5
+"""Machine time of all default quantities of ``interior-2k2`` with 1 %; measured: 18.0 s, without an accuracy 46.5 s."""
 
 
 def identified(folder: Path, accuracy: float | None, said: list[str]) -> tuple[RunDirectory, Stage]:
@@ -81,6 +81,26 @@ def test_each_experiment_is_chosen_by_what_it_would_reach() -> None:
     assert chosen.shot_samples == ALL.shot_samples
     assert chosen.speeds == ALL.speeds
     assert effort_for(0.01, predicting(1e-2, 1e-3, 1e-3)).speeds == SPEED_EFFORTS[0]
+
+
+def test_what_an_effort_leaves_out_is_said_by_quantity() -> None:
+    assert ALL.left_out == {}
+    quick = effort_for(0.01, predicting(1e-4, 1e-4, 1e-4))
+    assert quick.left_out == {
+        "R": "12 of 28 levels",
+        "L": "up to 1792 of 2048 samples of a square wave",
+        "psi": "2 of 4 speeds in each direction, down to 50 % of the largest speed",
+    }
+    assert "psi" not in effort_for(0.01, predicting(1e-4, 1e-4, 1e-1)).left_out
+
+
+def test_the_speed_of_the_flux_run_is_what_its_prediction_asks() -> None:
+    def predicted(one: Effort) -> Prediction:
+        return Prediction(1e-4, 1e-4, 2e-3 / one.speeds.speed_share)
+
+    shares = [effort_for(share, predicted).speeds.speed_share for share in (0.01, 0.006)]
+    assert shares == [0.5, 1.0]
+    assert effort_for(0.001, predicted).speeds == ALL.speeds
 
 
 def test_less_accuracy_never_takes_more() -> None:
@@ -143,6 +163,11 @@ def test_a_percent_takes_less_machine_time_and_the_truth_is_in_the_intervals(
         assert fact["statistical_95"] <= 0.01
         assert values[key]["systematic"] > 0.0, "the sensors' part stands beside it"
     assert accuracy_line(facts) in err and "; reached" in err
+    for key, quantity in (("R_s_ohm", "R"), ("L_d_h", "L"), ("psi_f_wb", "psi")):
+        told = facts[key]["left_out"]
+        assert any("left out for the accuracy" in line and f"{told} ({quantity})" in line for line in data["warnings"])
+    traces = {path.stem for path in (folder / "traces").iterdir()}
+    assert "first_turn" not in traces and "rotation_forward" not in traces
     assert "current limit proven: " in err and "speed limit proven: " in err
 
     before = (folder / "machine.toml").read_bytes()
@@ -237,8 +262,9 @@ def test_with_replay_the_run_decides(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_a_value_that_is_not_there_is_not_reached() -> None:
     found = {"R_s_ohm": Estimate(2.0, 0.002, 0.1, "ohm", dof=math.inf)}
-    facts = accuracy_facts(0.01, ("R", "psi"), found)
+    facts = accuracy_facts(0.01, ("R", "psi"), found, {})
     assert facts["R_s_ohm"]["reached"] and facts["R_s_ohm"]["statistical_95"] == pytest.approx(0.00196, rel=1e-3)
+    assert accuracy_facts(0.01, ("R",), found, {"R": "2 levels"})["R_s_ohm"]["left_out"] == "2 levels"
     assert facts["psi_f_wb"] == {"asked": 0.01, "statistical_95": None, "reached": False}
     assert accuracy_line(facts).endswith("R_s 0.2 %, psi_f no value; not reached: psi_f")
-    assert accuracy_facts(None, ("R",), found) == {} and accuracy_line({}) == ""
+    assert accuracy_facts(None, ("R",), found, {}) == {} and accuracy_line({}) == ""

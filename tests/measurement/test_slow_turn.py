@@ -17,7 +17,9 @@ from pmsmtool.experiments.rotation import (
     QUICK_STEP_RAD,
     RAMP_S,
     REST_LIMIT_S,
+    STUCK_S,
     SWING,
+    SWUNG_S,
     RotationPlan,
     come_to_rest,
     rising,
@@ -69,6 +71,10 @@ class SwingingRotor:
             self.theta += STEP_S * self.omega
             self.elapsed += STEP_S
             self.speeds.append(self.omega)
+
+    def live(self, name: str) -> float:
+        self.wait(FRAME_S)
+        return self.theta / POLE_PAIRS
 
     def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
         self.wait(FRAME_S + periods * self.period_s)
@@ -204,3 +210,24 @@ def test_the_largest_current_is_not_trusted_where_it_puts_a_jumping_rotor_beside
     found = measurement._rotation(0.0)
     assert found.offset.value == pytest.approx([0.0, 0.03, 0.1, of_the_largest][used], abs=0.03)
     assert (kept["rotation_forward"], kept["rotation_backward"]) == tries[used]
+
+
+@pytest.mark.parametrize("swing_rad_s", [3.0, 10.0, 30.0, 60.0, 105.0])
+@pytest.mark.parametrize("way_rad", [math.radians(60.0), -math.pi])
+def test_a_rotor_swings_onto_its_vector_whatever_its_inertia(swing_rad_s: float, way_rad: float) -> None:
+    """It says itself how long a turn takes: half a swing per sixth of a turn. Seen 1 to 8 degrees afterwards."""
+    drive = SwingingRotor(swing_rad_s)
+    told = turn_vector(drive, 1.0, 0.0, way_rad, SWUNG_S)  # type: ignore[arg-type]
+    swings = drive.elapsed * swing_rad_s / math.pi
+    parts = abs(way_rad) / math.radians(60.0)
+    assert drive.vector == way_rad and told <= drive.elapsed
+    assert swings < 1.5 * parts
+    drive.speeds.clear()
+    drive.wait(math.pi / swing_rad_s)
+    assert max(map(abs, drive.speeds)) < math.radians(10.0) * swing_rad_s
+
+
+def test_a_rotor_that_friction_holds_is_not_waited_for() -> None:
+    drive = SwingingRotor(30.0)
+    turn_vector(drive, 0.5 * FRICTION, 0.0, math.radians(60.0), SWUNG_S)  # type: ignore[arg-type]
+    assert drive.theta == 0.0 and STUCK_S < drive.elapsed < 2.0 * STUCK_S + 10.0 * FRAME_S

@@ -10,19 +10,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pmsmtool.arrays import Array
 from pmsmtool.drive.port import Halves
 from pmsmtool.experiments import standstill
 from pmsmtool.experiments.standstill import (
     ARRIVAL_LIMIT_S,
     ARRIVED,
     DC_ANGLE_RAD,
+    NEAR_ANGLES_RAD,
     PAIR_ARRIVED,
     PAIR_SHARES,
     SWINGING_TURN_S,
     LevelPlan,
+    calm_sequence,
+    falling_sequence,
     hold_levels,
     hold_pairs,
     hold_phase_vectors,
+    steady_half,
 )
 
 I_A = 10.0
@@ -33,6 +38,7 @@ class LateDrive:
     """A current loop that undershoots: ``short`` of the set-point is missing in the first windows after a command."""
 
     period_s = PERIOD_S
+    ripple = 0.0
 
     def __init__(self, short: float, windows: int) -> None:
         self.short, self.windows = short, windows
@@ -43,6 +49,13 @@ class LateDrive:
 
     def wait(self, seconds: float) -> None:
         pass
+
+    def live(self, name: str) -> float:
+        return 0.0
+
+    def record(self, signals: Sequence[str], samples: int, *, decimation: int = 1) -> Mapping[str, Array]:
+        t = np.arange(samples) * decimation * PERIOD_S
+        return {"U_dc_v": 48.0 * (1.0 + self.ripple * np.sin(2.0 * math.pi * 100.0 * t))}
 
     def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
         off = self.short if self.seen < self.windows else 0.0
@@ -137,14 +150,47 @@ def test_a_current_that_does_not_come_at_a_shaft_that_stands_is_not_waited_for()
 
 
 def test_a_vector_that_is_led_on_reaches_every_angle_forward() -> None:
-    """So the rests span 600 degrees (electrical) with as many turns of the vector as there and back."""
+    """So the rests of two signs and three pairs span 300 degrees (electrical)."""
     plan = LevelPlan((1.0, 4.0, -4.0, -1.0, 2.0), 1.5, DC_ANGLE_RAD, quick=True)
     levels = hold_levels(LateDrive(0.0, 0), plan)  # type: ignore[arg-type]
     quarters = levels["theta_imposed_rad"] / DC_ANGLE_RAD
     assert quarters == pytest.approx([1.0, 1.0, 3.0, 3.0, 5.0])
     assert "theta_imposed_rad" not in hold_levels(LateDrive(0.0, 0), replace(plan, quick=False)).signals  # type: ignore[arg-type]
-    pairs = hold_pairs(LateDrive(0.0, 0), I_A, 1.5, 5.0 * DC_ANGLE_RAD, quick=True)  # type: ignore[arg-type]
-    assert np.degrees(pairs["theta_imposed_rad"]) == pytest.approx([450.0, 450.0, 570.0, 570.0, 690.0, 690.0])
+    pairs = hold_pairs(LateDrive(0.0, 0), I_A, 1.5, 3.0 * DC_ANGLE_RAD, quick=True)  # type: ignore[arg-type]
+    assert np.degrees(pairs["theta_imposed_rad"]) == pytest.approx([270.0, 270.0, 330.0, 330.0, 390.0, 390.0])
+    assert pairs.meta["idle"] == list("aaccbb"), "the same pairs as on 90, 330 and 210 degrees, with the other sign"
+    assert hold_pairs(LateDrive(0.0, 0), I_A, 1.5, 0.0).meta["idle"] == list("aabbcc")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("ripple", "samples"), [(0.0, 400), (0.036, 1000)])
+def test_windows_are_short_on_a_steady_link_alone(ripple: float, samples: int) -> None:
+    drive = LateDrive(0.0, 0)
+    drive.ripple = ripple
+    plan = LevelPlan((4.0, 1.0), 1.5, DC_ANGLE_RAD, window_periods=400, quick=True)
+    assert hold_levels(drive, plan).meta["samples"] == samples // 2  # type: ignore[arg-type]
+    assert hold_levels(drive, replace(plan, quick=False)).meta["samples"] == 500  # type: ignore[arg-type]
+
+
+def test_noise_of_the_link_is_no_ripple() -> None:
+    drive = LateDrive(0.0, 0)
+    noise = np.random.default_rng(1).standard_normal(60)
+    drive.record = lambda *asked, **more: {"U_dc_v": 48.0 * (1.0 + 1e-3 * noise)}  # type: ignore[method-assign]
+    assert steady_half(drive, 400) == 200  # type: ignore[arg-type]
+
+
+def test_falling_levels_are_of_both_signs_and_rise_to_the_largest_alone() -> None:
+    """From a tenth of it the largest one at once took a link to its under-voltage."""
+    levels = falling_sequence([1.0, 3.0, 2.0, 4.0, 5.0], [0.1])
+    assert levels == (1.0, 3.0, 5.0, 4.0, 2.0, 0.1, -1.0, -3.0, -5.0, -4.0, -2.0, -0.1)
+    assert sorted(levels) == sorted(calm_sequence([1.0, 3.0, 2.0, 4.0, 5.0], [0.1]))
+
+
+def test_near_vectors_show_where_the_rotor_went() -> None:
+    """So an encoder that counts is seen without a turn of its own."""
+    near = hold_phase_vectors(SwingingDrive(), I_A, NEAR_ANGLES_RAD)  # type: ignore[arg-type]
+    assert near["theta_imposed_rad"].tolist() == list(NEAR_ANGLES_RAD) and "theta_M_rad" in near.signals
+    assert NEAR_ANGLES_RAD[-1] == DC_ANGLE_RAD, "the first level's"
+    assert "theta_M_rad" not in hold_phase_vectors(SwingingDrive(), I_A).signals  # type: ignore[arg-type]
 
 
 class HeavyDrive(LateDrive):
