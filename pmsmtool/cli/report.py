@@ -68,7 +68,8 @@ def report_command(
         raise click.UsageError("--for and --port belong to --follow, which writes no file (-o)")
     kind = ".json" if anonymous else ".xml" if junit else ".html"
     if path is not None and path.suffix.lower() not in ("", kind):
-        way = " with --anonymous" if anonymous else " with --junit" if junit else "; --pdf writes a .pdf beside the page"
+        beside = "; --pdf writes a .pdf beside the page"
+        way = " with --anonymous" if anonymous else " with --junit" if junit else beside
         raise click.UsageError(f"{path.name}: what is written is {kind}{way}")
     if follow:
         _follow(run, seconds, port, out)
