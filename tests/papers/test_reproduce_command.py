@@ -47,33 +47,29 @@ def test_list_names_every_figure(pmsmtool: Command) -> None:
 
 @pytest.mark.chain
 def test_tables_go_to_stdout_and_files_hold_the_same_bytes_twice(pmsmtool: Command, tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        done = pmsmtool("jercic-fig12", "-o", str(tmp_path / name))
-        assert done.exit_code == 0, done.stderr
-        assert "checked numbers: printed in the paper, or expected" in done.stdout
-        assert "predicted excess" in done.stdout
-        assert "wrote" in done.stderr
-        assert "wrote" not in done.stdout
-    files = sorted(path.name for path in (tmp_path / "one").iterdir())
-    assert files == [f"jercic-fig12.{suffix}" for suffix in ("csv", "json", "svg", "txt")]
-    assert all((tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in files)
-    stored = json.loads((tmp_path / "one" / "jercic-fig12.json").read_text(encoding="utf-8"))
+    done = pmsmtool("jercic-fig12", "-o", str(tmp_path / "one"))
+    assert done.exit_code == 0, done.stderr
+    assert "checked numbers: printed in the paper, or expected" in done.stdout
+    assert "predicted excess" in done.stdout
+    assert "wrote" in done.stderr
+    assert "wrote" not in done.stdout
+    written = {path.suffix: path for path in sorted((tmp_path / "one").iterdir())}
+    assert [path.name for path in written.values()] == [f"jercic-fig12.{end}" for end in ("csv", "json", "svg", "txt")]
+    stored = json.loads(written[".json"].read_text(encoding="utf-8"))
     assert stored["schema"] == "pmsmtool.reproduce/1"
     assert stored["ok"] is True
     assert len(stored["panels"][0]["series"][0]["x"]) == 19200
 
-
-@pytest.mark.chain
-def test_json_has_the_checks_and_one_file_can_be_asked_for(pmsmtool: Command, tmp_path: Path) -> None:
-    target = tmp_path / "t.csv"
-    done = pmsmtool("jercic-fig12", "--json", "-o", str(target), "--plot", str(tmp_path / "t.svg"))
+    asked = {end: tmp_path / f"two{end}" for end in (".csv", ".svg")}
+    done = pmsmtool("jercic-fig12", "--json", "-o", str(asked[".csv"]), "--plot", str(asked[".svg"]))
     data = json.loads(done.stdout)
     assert data["name"] == "jercic-fig12"
     assert all(check["within"] for check in data["checks"])
     assert data["tables"][1]["units"] == ["rpm/s", "%", "%"]
-    assert target.read_text(encoding="utf-8").startswith("panel,series,x,y")
-    assert (tmp_path / "t.svg").read_text(encoding="utf-8").startswith("<?xml")
-    assert len(list(tmp_path.iterdir())) == 2
+    assert all(path.read_bytes() == written[end].read_bytes() for end, path in asked.items())
+    assert asked[".csv"].read_text(encoding="utf-8").startswith("panel,series,x,y")
+    assert asked[".svg"].read_text(encoding="utf-8").startswith("<?xml")
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def outside(seed: int) -> Reproduction:
