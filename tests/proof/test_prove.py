@@ -62,17 +62,22 @@ from pmsmtool.units import RAD_S_PER_RPM
 
 pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
 
-FEW, FEWER = ProofRequest(runs=32), ProofRequest(runs=16)
-"""A third of the machines the tool draws; and a sixth, for a test that is alone with its prediction."""
+FEW = ProofRequest(runs=16)
+"""A sixth of the machines the tool draws."""
 SHARED = Shared()
 """The design and the conditions are the same in every test, and so is their prediction: it is made once."""
+
+
+def predict(design: Design, conditions: Conditions, plan: Any, **asked: Any) -> Prediction:
+    """Predict with as few machines from the command line, too, which draws twice of them at least."""
+    return SHARED.predict(design, conditions, plan, **{**asked, "runs": FEW.runs})
 
 
 @pytest.fixture(autouse=True)
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr(stages, "predict_proof", SHARED.predict)
+    monkeypatch.setattr(stages, "predict_proof", predict)
     monkeypatch.setattr("can.util.VALID_INTERFACES", frozenset({*can.VALID_INTERFACES, "pmsmsim"}))
     monkeypatch.setitem(can.interfaces.BACKENDS, "pmsmsim", ("pmsmtool.sim.bus", "PmsmSimBus"))
     return tmp_path
@@ -218,14 +223,14 @@ def test_what_identification_saw_is_in_the_band() -> None:
     known, settings = OF_MACHINE
     design = tune(replace(machine(), conditions=known), TuneRequest(field_weakening="lookup"))
     with flashed(design, truth=replace(machine(), simulation={**machine().simulation, **settings})) as drive:
-        _, stage = prove(drive, design, asked=replace(FEWER, experiments=("speed_step", "q_steps", "d_steps", "move")))
+        _, stage = prove(drive, design, asked=replace(FEW, experiments=("speed_step", "q_steps", "d_steps", "move")))
     assert stage.status == "pass", stage.note
 
 
 def test_a_healthy_drive_passes_within_a_small_current_limit(design: Design) -> None:
     """At full torque 5 A of the design's 12 A would all go into i_d, and the base speed would not be reached."""
     with flashed(design) as drive:
-        run, stage = prove(drive, design, asked=replace(FEWER, i_max_apk=5.0, experiments=("q_steps", "unreachable")))
+        run, stage = prove(drive, design, asked=replace(FEW, i_max_apk=5.0, experiments=("q_steps", "unreachable")))
     assert stage.status == "pass", stage.note
     (folder,) = (run.path / "prove").iterdir()
     prediction, traces = read_proof(folder)
@@ -241,14 +246,14 @@ def test_a_link_below_what_it_showed_at_rest_is_named(design: Design, monkeypatc
 
     monkeypatch.setattr(stages, "conditions_of", at_rest)
     with flashed(design) as drive:
-        _, stage = prove(drive, design, asked=replace(FEWER, experiments=("unreachable",)))
+        _, stage = prove(drive, design, asked=replace(FEW, experiments=("unreachable",)))
     assert stage.status == "fail" and "likely the voltage is too low" in stage.note
 
 
 def test_what_a_sagging_link_decides_is_not_judged(design: Design) -> None:
     """A supply that falls by 5 % under load is a healthy one, and what it gives decides at the voltage limit."""
     with flashed(design, truth=replace(machine(), simulation={"U_dc_source_ohm": 6.0})) as drive:
-        _, stage = prove(drive, design, asked=replace(FEWER, experiments=("q_steps", "unreachable")))
+        _, stage = prove(drive, design, asked=replace(FEW, experiments=("q_steps", "unreachable")))
     assert stage.status == "pass", stage.note
     left = [line for line in stage.fallbacks if "not judged: under load the DC link falls from 540 to" in line]
     assert left and not [line for line in stage.acceptance if line.what.startswith("unreachable")]
@@ -362,7 +367,7 @@ def test_a_heavy_shaft_is_given_the_time_it_needs() -> None:
     made = tune(heavy, TuneRequest())
     with flashed(made, truth=heavy) as drive:
         stage = prove_stage(
-            begin_run(drive, Path("runs")), drive, made, replace(FEWER, experiments=("unreachable",)),
+            begin_run(drive, Path("runs")), drive, made, replace(FEW, experiments=("unreachable",)),
             lambda shown: None, lambda line: None,
         )  # fmt: skip
         assert is_safe(drive.node.state())
@@ -376,7 +381,7 @@ def test_a_speed_that_is_not_reached_is_named(design: Design, monkeypatch: pytes
     monkeypatch.setattr(measured, "REACH_FACTOR", 0.0)
     monkeypatch.setattr(measured, "REACH_TIMES", 0.0)
     with flashed(design) as drive:
-        _, stage = prove(drive, design, asked=replace(FEWER, experiments=("speed_step", "q_steps")))
+        _, stage = prove(drive, design, asked=replace(FEW, experiments=("speed_step", "q_steps")))
         assert is_safe(drive.node.state())
     assert stage.status == "fail"
     assert "the speed was not reached: " in stage.note and "before q_steps" in stage.note
