@@ -243,8 +243,8 @@ def test_a_current_that_comes_late_or_ends_at_the_voltage_is_no_open_phase() -> 
 )
 def test_identify_names_wrong_wiring_of_an_epos4(tool: Tool, key: str, code: int, named: str) -> None:
     """Before, an open phase was called a shaft with little inertia, and swapped leads were not named at all."""
-    channel = f"interior-2k2?nv=:memory:&drive=epos4&{key}"
-    got, out, told = tool("-i", "pmsmsim", "-c", channel, "identify", "mechanics", "--yes")
+    channel = f"interior-2k2?nv=:memory:&drive=epos4&{key}&bitrate=250000"
+    got, out, told = tool("-i", "pmsmsim", "-c", channel, "identify", "mechanics", "--yes", "--speed-max", "400rpm")
     assert got == code and named in out + told
 
 

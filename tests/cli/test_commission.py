@@ -51,9 +51,13 @@ BUSY_RETRIES = 5
 
 @pytest.fixture
 def few_machines(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A proof predicted with a sixth of the machines the tool draws, where it is one of the stages."""
+    """A proof of two experiments, with a sixth of the machines the tool draws, where it is one of the stages."""
     proof_within = commission.proof_within
-    monkeypatch.setattr(commission, "proof_within", lambda asked: replace(proof_within(asked), runs=16))
+    monkeypatch.setattr(
+        commission,
+        "proof_within",
+        lambda asked: replace(proof_within(asked), runs=16, experiments=("speed_step", "q_steps")),
+    )
 
 
 def the_run() -> tuple[RunDirectory, RunRecord]:
@@ -109,7 +113,7 @@ def test_a_failed_criterion_ends_the_chain_and_resume_goes_on_there_on_the_runs_
     assert [given["subject"] for given in record.consents] == ["writing", "motion"]
     assert record.stages[-1].name == "prove" and record.stages[-1].status == "pass"
     page = (directory.path / "report.html").read_text()
-    assert ">SIMULATED DRIVE, PASS: 7 of 7 stages ran" in page and page.count("<svg") == 15
+    assert ">SIMULATED DRIVE, PASS: 7 of 7 stages ran" in page and page.count("<svg") == 10
     assert (directory.path / "machine.toml").read_bytes() == measured
     assert tool("verify", *bus[:-1], "run")[0] == 0
     assert tool("commission", "--resume", "run")[0] == 0, "nothing is left to do, so nobody is asked"
@@ -143,7 +147,7 @@ def test_through_another_process_with_the_limits_a_real_drive_needs(
 
 # ---- less than everything ---------------------------------------------------------------------------------
 
-COPLEY = ("-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=cia402", "--yes")
+COPLEY = ("-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=cia402&bitrate=125000", "--yes")
 SHEET = str(data_folder("profiles") / "interior-2k2.toml")
 
 
@@ -159,13 +163,13 @@ def test_a_stage_that_is_required_and_cannot_be_had_ends_it_before_anything_move
 
 
 def test_a_stage_that_turns_out_to_be_missing_ends_a_chain_that_requires_it(tool: Tool) -> None:
-    code, _, err = tool("commission", SHEET, *COPLEY, "--require", "margins")
+    code, _, err = tool("commission", SHEET, *COPLEY, "--require", "margins", "--speed-max", "400rpm")
     assert code == 1 and "margins: not available" in err
     assert [stage.name for stage in the_run()[1].stages][-1] == "margins"
 
 
 def test_a_design_below_the_ratings_fails_unless_a_person_accepts_each_limit(tool: Tool) -> None:
-    asked = ("commission", SHEET, *COPLEY, "--drive-bandwidth-hz", "800")
+    asked = ("commission", SHEET, *COPLEY, "--drive-bandwidth-hz", "800", "--speed-max", "400rpm")
     code, _, err = tool(*asked)
     assert code == 1, "--yes does not accept it"
     assert "A pk, limit >= 6.08 A pk (or --accept-limit current)" in err

@@ -28,6 +28,7 @@ from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, Declined, IdentificationError, Interrupted, NotAvailable
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.files import data_folder
+from pmsmtool.identification.by_pulses import pulse_result
 from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_machine_file, machine_path
 from pmsmtool.measurement.by_pulses import HEADROOM, push_by_torque, swing_and_record, turn_both_ways
@@ -39,7 +40,7 @@ from pmsmtool.measurement.capabilities import (
     examine,
     reference_capabilities,
 )
-from pmsmtool.sim.simulated_machine import settings_of
+from pmsmtool.trace import Trace
 
 COMMANDS = (0x604000, 0x206007)
 """Controlword and the recorder's command: nothing a restore would bring back."""
@@ -117,15 +118,17 @@ def test_what_caps_promises_is_what_is_found_without_a_dead_time() -> None:
     promised = {expected.given: expected.half_width for expected in WAYS["psi"][Method.STANDARD].expected}
     known = load_machine_file(machine_path("interior-2k2")).inverter
     assert known is not None
+    traces: dict[str, Trace] = {}
+    with connect("pmsmsim", "interior-2k2?nv=:memory:&drive=epos4") as connection:
+        drive = TorqueDrive(connection, 1, drive_map=load_family("epos4"))
+        envelope = Envelope(i_max_apk=7.3, speed_max_rad_s=3000.0 * math.pi / 30.0, duration_s=600.0)
+        facts = push_by_torque(drive, envelope, traces.__setitem__, lambda text: None)
+        drive.close()
     for given, inverter in (
         ("", replace(known, dead_time_s=0.0)),  # as `machine new` without --dead-time leaves it
         ("a machine file that names the dead time", known),
     ):
-        with connect("pmsmsim", "interior-2k2?nv=:memory:&drive=epos4") as connection:
-            drive = TorqueDrive(connection, 1, drive_map=load_family("epos4"))
-            envelope = Envelope(i_max_apk=7.3, speed_max_rad_s=3000.0 * math.pi / 30.0, duration_s=600.0)
-            psi = told_by(push_by_torque, drive, envelope, inverter, pole_pairs=3).estimates["psi_f_wb"]
-            drive.close()
+        psi = pulse_result(traces, replace(facts, pole_pairs=3), None, inverter).estimates["psi_f_wb"]
         half = 100.0 * total_half_width(psi) / psi.value
         assert 0.85 * promised[given] < half <= promised[given], "measured: 6.1 of 6.4 %, 3.7 of 3.7 %"
 
@@ -236,12 +239,13 @@ def test_commission_of_a_drive_that_gives_nothing_is_exit_9(monkeypatch: pytest.
 @pytest.mark.chain
 def test_identify_by_cia402_alone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    outcome = run("--sim", CHANNEL + "&drive=cia402", "--yes", "identify", "--json")
+    outcome = run("--sim", CHANNEL + "&drive=cia402&bitrate=250000", "--yes", "identify", "--json")
     assert outcome.exit_code == 0, outcome.exception
     facts = json.loads(outcome.stdout)
     values = {value["name"]: value["value"] for value in facts["values"]}
     assert values["pole_pairs"] == 3.0 and values["direction"] == 1.0
-    assert math.degrees(abs(values["offset_rad"] - 0.35)) < 2.0
+    # issue: 2 deg; the program benchmarks.level_intervals measured 0.2 deg at most over 40 drives
+    assert math.degrees(abs(values["offset_rad"] - 0.35)) < 0.5
     traces = {path.stem for path in Path(facts["run"], "traces").iterdir()}
     assert {"rotation_backward", "rotation_forward", "torque_push_0", "voltage_limit"} <= traces
     truth = load_machine_file(data_folder("profiles") / "interior-2k2.toml").machine
@@ -286,35 +290,6 @@ def machine(tmp_path: Path, seed: int) -> tuple[MachineFile, Path]:
 def envelope_for(drive: MachineFile) -> Envelope:
     assert drive.machine.I_nom_apk is not None and drive.machine.n_max_rpm is not None
     return Envelope(HEADROOM * drive.machine.I_nom_apk, drive.machine.n_max_rpm * math.pi / 30.0)
-
-
-@pytest.mark.chain
-def test_pole_pairs_and_offset_of_a_random_drive_by_cia402(tmp_path: Path) -> None:
-    drive, path = machine(tmp_path, 100)
-    with connect("pmsmsim", f"{path}?nv=:memory:&drive=cia402") as connection:
-        simulated = connection.bus.line.nodes[0].session  # type: ignore[attr-defined]
-        standard = StandardDrive(connection, 1, drive_map=load_family("cia402"))
-        found = told_by(turn_both_ways, standard, envelope_for(drive)).estimates
-        assert not simulated.power.state.energised
-        standard.close()
-    truth = settings_of(drive).number("encoder_offset_rad")
-    assert found["pole_pairs"].value == drive.machine.pole_pairs
-    # issue: 2 deg; the program benchmarks.level_intervals measured 0.2 deg at most over 40 drives
-    assert abs(math.degrees(math.remainder(found["offset_rad"].value - truth, 2.0 * math.pi))) < 0.5
-
-
-@pytest.mark.chain
-def test_flux_linkage_by_a_recorder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """On the profile: its inverter is averaged, so that the test is quick; random drives are the program's."""
-    monkeypatch.chdir(tmp_path)
-    outcome = run("--sim", CHANNEL + "&level=recorder", "--yes", "identify", "R", "psi", "L", "--json")
-    assert outcome.exit_code == 0, outcome.exception
-    found = {value["name"]: value for value in json.loads(outcome.stdout)["values"]}
-    truth = load_machine_file(data_folder("profiles") / "interior-2k2.toml").machine
-    # random drives are judged by benchmarks.level_intervals
-    assert found["psi_f_wb"]["value"] == pytest.approx(truth.psi_f_wb, rel=0.015)
-    assert found["L_q_app_h"]["value"] == pytest.approx(truth.L_q_h, rel=0.05)
-    assert found["R_s_ohm"]["value"] == pytest.approx(truth.R_s_ohm, rel=0.03)
 
 
 @pytest.mark.chain

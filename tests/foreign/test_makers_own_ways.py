@@ -26,7 +26,7 @@ def commissioned(
     tool: Tool, rows: tuple[Row, ...], limits: dict[tuple[int, int], tuple[int, int]] | None = None
 ) -> tuple[int, str]:
     write_eds(Path("x.eds"), rows, limits)
-    code, _, said = tool("--yes", "commission", str(machine_path(PROFILE)), "--eds", "x.eds")
+    code, _, said = tool("--yes", "commission", str(machine_path(PROFILE)), "--eds", "x.eds", "--speed-max", "400rpm")
     return code, said
 
 
@@ -79,6 +79,9 @@ def test_mode_11_tells_pole_pairs_and_its_refusal_leaves_the_pulses(tool: Tool, 
     assert code == 10 and "[1/7] identify  PASS" in said and "J_per_psi" in said, said
     assert said.count("at most 6.08 Apk") == 1, "asked once"
     assert pole_pairs == (["3", "agrees"] if taken else ["NOT", "CHECKED"]), said
+    assert "E_NOT_ACCEPTED" not in said
+    (record,) = Path("runs").glob("*/run.json")
+    assert ("(11), which 0x6502 announces" in record.read_text(encoding="utf-8")) is not taken
 
 
 def test_a_drive_that_is_off_and_takes_no_controlword_is_off(tool: Tool) -> None:

@@ -49,7 +49,7 @@ def test_a_resolution_that_the_speed_contradicts(
     monkeypatch.setattr(ForeignDrive, "attach", set_up)
     eds = write_eds(Path("x.eds"), unknown("0x2D", *MOVES, *unit(word)))
     asked = ("--yes", "move", "--by", "90deg", "--speed-max", "800rpm", "--settle", "0.2s")
-    sim = ("--sim", f"interior-2k2?nv=:memory:&eds={eds}")
+    sim = ("--sim", f"interior-2k2?nv=:memory:&eds={eds}&bitrate=500000")
     code, _, said = tool(*sim, *asked)
     told = re.search("shows ([0-9.]+) times the speed", said)
     assert code == 0 and bool(told) == named, said
