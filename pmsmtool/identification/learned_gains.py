@@ -334,6 +334,8 @@ def convention(
     misses = {kind: abs(found - math.log(ratio)) / std for kind, ratio in CONVENTIONS.items()}
     best, second = sorted(misses, key=lambda kind: misses[kind])[:2]
     facts = math.exp(mean), torque_per_apk, std
+    if any(o.loop.at_bound for o in observed):
+        return Convention(None, *facts, "the fit of the response ended at a bound")
     if misses[best] > NOT_SAME:
         return Convention(None, *facts, f"torque per shown ampere is {math.exp(found):.2f} of the peak one")
     if misses[second] < EXCLUDED:

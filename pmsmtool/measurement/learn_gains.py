@@ -83,6 +83,7 @@ PULSES, PULSE_JUMP, PULSE_LEAST = 4, 0.4, 0.25
 winds up goes as far beyond it); their least current, of that of the steps."""
 PULSE_TIMES, PULSE_SHOWN_S = 3.0, 0.02
 """How long a pulse lasts: time constants of the current loop's integral, and time beside them (s)."""
+TIMES = {"lag": "the loop's lag", "late": "the delay of a reference", "age": "the age of the current"}
 LEAST_AT_REST = 40
 """Samples before the first step that the noise is read from."""
 SPEED_SHARE = 0.4
@@ -430,6 +431,11 @@ class _Learner:
 
         ``worst`` is by what K_p and K_i may have changed whatever the form: the margin is predicted for each.
         """
+        if time := own.loops[-1].at_bound:
+            self.notes.append(
+                f"{gain.name}: not changed, for the fit of the response ended at the bound of {TIMES[time]}"
+            )
+            return None
         try:
             new = changed_counts(gain, ratio)
         except NotAvailable as error:

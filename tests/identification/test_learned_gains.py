@@ -108,6 +108,13 @@ def test_convention_from_the_acceleration_of_an_ampere(kind: str, ratio: float) 
     assert convention(read_as_rms, Rotor(J, 0.04, 1.0, F_S), torque_per_apk, 0.03, math.sqrt(2.0)).kind == wide.kind
 
 
+def test_a_fit_that_ended_at_a_bound_decides_no_convention() -> None:
+    rms = loop(A0, A0 * RATE, amps=J / (0.3 * math.sqrt(2.0)))
+    for at_bound, kind in (("", "rms"), ("lag", None)):
+        shown = [Observation(1, 1, replace(rms, at_bound=at_bound))]
+        assert convention(shown, Rotor(J, 0.04, 1.0, F_S), 0.3, 0.03, 1.0).kind == kind
+
+
 def test_what_the_emf_may_take_is_in_the_interval_that_it_moves() -> None:
     base, gain_changed, integral_changed = observed("time")
     ends = loop(A0, A0 * RATE), loop(1.16 * A0, 1.16 * A0 * RATE)

@@ -12,7 +12,10 @@ import pytest
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.identification.speed_loop_response import (
+    AT_BOUND_S,
+    LEAST_LAG_S,
     Emf,
+    SpeedLoop,
     StepRecord,
     fit_pulses,
     fit_speed_loop,
@@ -67,7 +70,14 @@ def test_gains_over_inertia(a: float, b: float, filter_s: float, every: int, lat
     found = fit_speed_loop(simulated(a, b, filter_s, every, latency_s, climbing(20.0, 8.0), 1), NO_EMF)
     assert found.K_p_per_J == pytest.approx(a, rel=0.02)
     assert found.K_i_per_J == pytest.approx(b, rel=0.03)
-    assert found.amps_per_rad_s2 == pytest.approx(AMPS_PER_RAD_S2, rel=0.03)
+    assert found.amps_per_rad_s2 == pytest.approx(AMPS_PER_RAD_S2, rel=0.03) and not found.at_bound
+
+
+@pytest.mark.chain
+def test_a_fit_that_ends_at_a_bound_says_so() -> None:
+    short = simulated(40.0, 320.0, 8e-4, 5, 5e-4, [(0.0, 20.0), (0.2, 28.0)], 1)
+    first = SpeedLoop(40.0, 320.0, 2e-3, 1e-3, AMPS_PER_RAD_S2)
+    assert fit_speed_loop(short, NO_EMF, first, LEAST_LAG_S + 0.5 * AT_BOUND_S).at_bound == "lag"
 
 
 @pytest.mark.chain
