@@ -41,7 +41,7 @@ from pmsmtool.identification.learned_gains import Learned
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.temperature import magnet_flux_at
 from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, gain_object
-from pmsmtool.measurement.learn_gains import learn_speed_loop, within_budget
+from pmsmtool.measurement.learn_gains import DURATION_S, learn_speed_loop, within_budget
 from pmsmtool.measurement.learn_position_gain import FORWARD, POSITION, learn_position_gain, position_gain
 from pmsmtool.measurement.learned_rows import emf_of, learned_gains, shown_currents
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
@@ -153,7 +153,7 @@ def _learn(connection: Connection, told: MachineFile, machine: MachineFile, gain
     gain, integral = gain_object(drive.node, GAIN, *gains.gain), gain_object(drive.node, INTEGRAL, *gains.integral)
     speed_max = SPEED_SHARE * rad_s_from_rpm(told.machine.n_max_rpm or 1000.0)
     i_max = within_budget(drive, told.machine, drive.rated_apk, speed_max)
-    envelope = Envelope(i_max, speed_max, duration_s=120.0)
+    envelope = Envelope(i_max, speed_max, duration_s=DURATION_S)
     drive_live = drive.live
     largest = 0.0
 

@@ -77,7 +77,7 @@ SETTLE_S, REST_AT_LOW_S, LEAST_S = 0.8, 0.4, 2.4
 SETTLE_TIMES, LONGEST_S = 8.0, 4.0
 """Time constants of the integral for which the first speed is held, and at most how long; half of them at half gain."""
 LONGER = 2
-"""Times as long a record lasts where the current that is asked for is not shown: ripple moved its K_i by 3 to 10 %."""
+"""Times as long the records last that scales rest on: in shorter ones ripple moved K_i by 3 to 10 %."""
 PULSES, PULSE_JUMP, PULSE_LEAST = 4, 0.4, 0.25
 """How many torque pulses; their jump of the reference, of the speeds between which it climbs (a loop whose integral
 winds up goes as far beyond it); their least current, of that of the steps."""
@@ -271,8 +271,8 @@ class _Learner:
         self.hold_s = min(max(wanted_s, HOLD_S[0]), HOLD_S[1])
         step = self._size()
         if not self.asks:
-            self.least_s *= LONGER
             self._show_current_loop(step)
+        self.least_s *= LONGER
         own = self._observe(f"with steps held for {1e3 * self.hold_s:.0f} ms", step, counts, own.loop)
         drive.oscillation.limit_a = TRIP * max(drive.oscillation.largest_a, drive.current_count_a)
         half = self._observe("with steps of half the size", 0.5 * step, counts, own.loop, own.loop.lag_s)

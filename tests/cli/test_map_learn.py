@@ -8,6 +8,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -16,6 +17,7 @@ from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import GuardedDrive, guarded
+from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.speed_loop_drive import Oscillation, SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
@@ -23,7 +25,7 @@ from pmsmtool.errors import DriveFault, LimitExceeded, SafetyRefusal
 from pmsmtool.flash.gain_journal import any_left
 from pmsmtool.identification.asked_current import AskedLoop
 from pmsmtool.identification.learned_gains import Observation
-from pmsmtool.identification.speed_loop_response import SpeedLoop
+from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.measurement import changed_gains, learn_gains, learn_position_gain
 from pmsmtool.measurement.learned_rows import MeasuredRow, with_measured
@@ -281,6 +283,42 @@ def test_the_predicted_margin_counts_on_the_integral_part_that_the_loop_asks_for
     assert margin == pytest.approx(math.radians(42.0), abs=MARGIN_TOL_RAD) and margin > learn_gains.LEAST_MARGIN_RAD
     alone = learn_gains._margin(replace(own, asked=None), (1.0, 1.0 / learn_gains.LITTLE_DOWN))
     assert alone == pytest.approx(math.radians(35.0), abs=MARGIN_TOL_RAD)
+
+
+@pytest.mark.parametrize(("asks", "at_bound"), [(True, ""), (False, ""), (False, "lag")])
+def test_what_scales_rest_on_is_recorded_long_and_nothing_is_changed_on_a_fit_at_a_bound(
+    asks: bool, at_bound: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 1112 (an EPOS4, which shows the asked current) ripple moved K_i by 9 % in 2.4 s."""
+    lasted: list[float] = []
+    pulses: list[float] = []
+    put: list[object] = []
+    loop = SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02, at_bound=at_bound)
+
+    def observe(self: Any, what: str, step: float, counts: Any, *known: Any) -> Observation:
+        lasted.append(self.least_s)
+        self.asks = asks
+        return Observation(
+            counts[GAIN], counts[INTEGRAL], loop, asked=AskedLoop(loop, (0.0, 0.0, 0.0)) if asks else None
+        )
+
+    monkeypatch.setattr(learn_gains, "find_speed_unit", lambda *arguments: 1e-3)
+    monkeypatch.setattr(learn_gains._Learner, "_observe", observe)
+    monkeypatch.setattr(learn_gains._Learner, "_size", lambda self: 1.0)
+    monkeypatch.setattr(learn_gains._Learner, "_show_current_loop", lambda self, step: pulses.append(step))
+    guard, drive = MagicMock(envelope=Envelope(6.0, 50.0)), MagicMock(current_count_a=0.01)
+    drive.oscillation.largest_a = 1.0
+    learner = learn_gains._Learner(guard, drive, lambda *arguments: put.append(arguments), Emf(0.0, 100.0), print)
+    gain, integral = DriveObject(0x60F9, 1, "H"), DriveObject(0x60F9, 2, "H")
+    measured = learner.run(
+        changed_gains.GainObject(GAIN, gain, 1000.0), changed_gains.GainObject(INTEGRAL, integral, 1000.0)
+    )
+    assert lasted[:3] == [learn_gains.LEAST_S, *(learn_gains.LONGER * learn_gains.LEAST_S,) * 2]
+    assert bool(pulses) != asks and measured.by_asked == asks
+    assert bool(put) != bool(at_bound)
+    if at_bound:
+        assert measured.gain_changed is None and not measured.integral_changed
+        assert any("bound of the loop's lag" in note for note in measured.notes)
 
 
 def test_an_oscillation_trips() -> None:
