@@ -243,20 +243,27 @@ def test_what_was_assumed_of_the_link_is_told() -> None:
     assert told.startswith("the DC link falls by 4.2 % under the test current: 75 +- 50 % of the inverter's error")
 
 
+BEYOND = 1.01 / PLATEAU_SEEN
+
+
 @pytest.mark.parametrize(
-    ("V_dead", "plateau", "knee", "hidden"),
+    ("V_dead", "plateau", "knee", "threshold", "hidden_v"),
     [
-        (1.0, 0.0, 0.9 * KNEE_SHARE, False), (1.0, 0.0, 1.1 * KNEE_SHARE, True), (-1.0, 0.0, 1.1 * KNEE_SHARE, True),
-        (1.0, 1.0 / PLATEAU_SEEN, 0.1, False), (1.0, 1.01 / PLATEAU_SEEN, 0.1, True),
+        (1.0, 0.0, 0.9 * KNEE_SHARE, 0.0, 0.0), (1.0, 1.0 / PLATEAU_SEEN, 0.1, 0.0, 0.0),  # the levels reach it
+        (1.0, 0.0, 1.1 * KNEE_SHARE, 0.0, 0.0), (1.0, 0.0, 2.0, 0.0, 0.5),  # flat in the end; half of it lacks
+        (1.0, BEYOND, 0.1, 0.0, 1.15 * BEYOND - 1.0),  # a dead time of 1.15 of what the drive says
+        (1.0, BEYOND, 0.1, 0.1, 1.15 * BEYOND + 0.1 - 1.0), (1.0, BEYOND, 0.1, 1.2, BEYOND),  # the whole at most
+        (1.0, 0.1, 5.0, 0.0, 0.8), (1.0, 0.0, 1.0, 0.0, 1.0),  # just there, and still rising: all of it may go on
+        (-1.0, 0.0, 1.1 * KNEE_SHARE, 0.0, 1.0),
     ],
 )  # fmt: skip
-def test_what_the_knee_may_hide_is_the_plateau_over_the_largest_level(
-    V_dead: float, plateau: float, knee: float, hidden: bool
+def test_what_the_knee_may_hide_is_what_its_error_lacks_over_the_largest_level(
+    V_dead: float, plateau: float, knee: float, threshold: float, hidden_v: float
 ) -> None:
     i = np.linspace(0.2, 4.0, 39)
     curve = InverterCurve(i, V_dead * np.minimum(1.0, i / (4.0 * knee)), 0.0)
-    expected = max(abs(V_dead), plateau) / 4.0 if hidden else 0.0
-    assert resistance._hidden_in_knee(curve, V_dead, plateau) == pytest.approx(expected, rel=EXACT)
+    found = resistance._hidden_in_knee(curve, V_dead, plateau, threshold)
+    assert found == pytest.approx(hidden_v / 4.0, rel=EXACT, abs=1e-12)
 
 
 # ---- gates ------------------------------------------------------------------------------------------------------
