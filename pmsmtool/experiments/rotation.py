@@ -50,8 +50,6 @@ random drives (21 rad/s on 0.35 of the test current). Their rotors left the vect
 TURN_S = 0.6
 """Time of a turn from standstill to standstill: as much at 0.15 of the test current, of all but the slowest."""
 TURN_DWELL_S = 0.015
-SWUNG_S = 0.0
-"""In place of the time of a turn: as long as the rotor swings."""
 SWUNG_RAD = math.pi / 3.0
 """Longest turn by one swing."""
 SWING_LOOK_S, SPANS = 0.003, 8
@@ -79,14 +77,14 @@ def rising(steps: int) -> tuple[float, ...]:
     return tuple(0.5 - 0.5 * math.cos(math.pi * (k + 0.5) / steps) for k in range(steps))
 
 
-def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float, turn_s: float = TURN_S) -> float:
+def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float, turn_s: float | None = TURN_S) -> float:
     """Turn a current vector along half a cosine, so that the rotor follows instead of jumping; return the time (s).
 
     A rotor left half an electrical turn off its vector stands on a top: friction holds it there until the current is
-    large, and then it falls over with all of it. With :data:`SWUNG_S` the rotor itself says how long a turn takes: it
+    large, and then it falls over with all of it. Without a time the rotor itself says how long a turn takes: it
     swings about the middle of a sixth of a turn, and the vector goes to its end when the rotor turns back there.
     """
-    if turn_s == SWUNG_S:
+    if turn_s is None:
         parts = max(1, math.ceil(abs(end_rad - start_rad) / SWUNG_RAD - 1e-6))
         part, waited = (end_rad - start_rad) / parts, 0.0
         for k in range(parts):

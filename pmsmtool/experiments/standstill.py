@@ -17,7 +17,7 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.drive.standard_drive import StandardDrive
-from pmsmtool.experiments.rotation import SWUNG_S, TURN_S, come_to_rest, lead_onto_vector, turn_vector
+from pmsmtool.experiments.rotation import TURN_S, come_to_rest, lead_onto_vector, turn_vector
 from pmsmtool.experiments.signals import readable, table
 from pmsmtool.trace import Trace
 
@@ -125,8 +125,8 @@ class LevelPlan:
         Electrical angle of the vector in the stator frame.
     drift : float
         Change of the voltage between the halves of a window, relative, that asks for another window.
-    turn_s : float
-        Time of a turn of the vector, of the waits alone (s).
+    turn_s : float or None
+        Time of a turn of the vector, of the waits alone (s); None: as long as the rotor swings.
     quick : bool
         Whether every change of sign turns the vector on instead of back, so that the rests show the pole pairs; a rotor
         that stands where it stood before the current changed is at rest then without a second look, and a swing braked;
@@ -140,7 +140,7 @@ class LevelPlan:
     window_periods: int = LEVEL_WINDOW
     angle_rad: float = DC_ANGLE_RAD
     drift: float = DRIFTED
-    turn_s: float = TURN_S
+    turn_s: float | None = TURN_S
     quick: bool = False
 
 
@@ -237,7 +237,7 @@ def hold_phase_vectors(drive: Drive, i_a: float, angles_rad: Sequence[float] = P
             drive.enable()
         begun, before = elapsed, math.inf
         if rows and near:
-            elapsed += turn_vector(drive, i_a, last, angle, SWUNG_S)
+            elapsed += turn_vector(drive, i_a, last, angle, None)
         last = angle
         drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
         while True:
@@ -270,7 +270,7 @@ def hold_pairs(
     i_a: float,
     turn_a: float,
     start_rad: float,
-    turn_s: float = TURN_S,
+    turn_s: float | None = TURN_S,
     *,
     quick: bool = False,
     half: int | None = None,
@@ -286,9 +286,10 @@ def hold_pairs(
         Enabled; it holds zero current on return.
     i_a : float
         Larger current (A peak).
-    turn_a, start_rad, turn_s : float
-        Current that turns the rotor from pair to pair (A peak), the vector that was held last (rad electrical), and the
-        time of a turn (s).
+    turn_a, start_rad : float
+        Current that turns the rotor from pair to pair (A peak), and the vector that was held last (rad electrical).
+    turn_s : float or None
+        Time of a turn (s); None: as long as the rotor swings.
     quick : bool
         Whether the rows also have the angles of vector and encoder, the vector goes on by 60 degrees from pair to pair,
         and a swing is braked.
@@ -334,7 +335,7 @@ def hold_pairs(
     return table(rows, times, samples=samples, i_command_a=i_a, idle=idle)
 
 
-def turn_and_look(drive: Drive, i_a: float, start_rad: float, end_rad: float, turn_s: float = TURN_S) -> Trace:
+def turn_and_look(drive: Drive, i_a: float, start_rad: float, end_rad: float, turn_s: float | None = TURN_S) -> Trace:
     """Turn a current vector slowly and return where the encoder stood before and after."""
     drive.command_current(i_a, 0.0, fixed_angle_rad=start_rad)
     settle(drive, i_a)

@@ -94,7 +94,7 @@ class Effort:
     """
 
     levels: LevelEffort = ALL_LEVELS
-    turn_s: float = rotation.TURN_S
+    turn_s: float | None = rotation.TURN_S
     turn_share: float = 0.0
     quick: bool = False
     rotations: tuple[Rotation, ...] = ()
@@ -108,13 +108,20 @@ class Effort:
         if self.levels != ALL_LEVELS:
             held, all_of = (2 * (len(one.magnitudes(1.0)) + len(one.low)) for one in (self.levels, ALL_LEVELS))
             found["R"] = f"{all_of - held} of {all_of} levels"
+        waves = ["one of two fast square waves"] if self.quick else []
         if self.shot_samples != square_injection.SHOT_SAMPLES:
             all_of = square_injection.SHOT_SAMPLES
-            found["L"] = f"up to {all_of - self.shot_samples} of {all_of} samples of a square wave"
+            waves.append(f"up to {all_of - self.shot_samples} of {all_of} samples of a square wave")
+        if waves:
+            found["L"] = ", ".join(waves)
         if self.speeds != ALL_SPEEDS:
             share, all_of = self.speeds.speed_share, len(speed_run.SHARES)
             slower = f", down to {100.0 * share:.0f} % of the largest speed" if share < 1.0 else ""
-            found["psi"] = f"{all_of - len(self.speeds.shares)} of {all_of} speeds in each direction{slower}"
+            held, currents = (sum(map(len, one.d_shares)) for one in (self.speeds, ALL_SPEEDS))
+            speeds = f"{all_of - len(self.speeds.shares)} of {all_of} speeds in each direction{slower}"
+            found["psi"] = f"{speeds}, {currents - held} of {currents} d currents"
+            rows = mechanics_run.ROWS
+            found["mechanics"] = f"{rows - self.speeds.mechanics_rows} of {rows} rows of a torque pulse"
         return found
 
 
@@ -125,7 +132,10 @@ LEVEL_EFFORTS = (
     ALL_LEVELS,
 )
 SHOT_EFFORTS = (256, 512, 1024, square_injection.SHOT_SAMPLES)
-_TWO_SPEEDS = SpeedEffort((0.42, 0.85), ((1.0,), (1.0 / 3.0, 1.0, 1.0)), (0,), 0.04, 256, 800, 1.0, 64, 0.05, True)
+_TWO_SPEEDS = SpeedEffort(
+    (0.42, 0.85), ((1.0,), (1.0 / 3.0, 1.0, 1.0)), (0,), window_s=0.04, push_samples=256, mechanics_rows=800,
+    answer_samples=64, answer_share=0.05, quick=True,
+)  # fmt: skip
 SPEED_EFFORTS = (replace(_TWO_SPEEDS, speed_share=0.5), _TWO_SPEEDS, ALL_SPEEDS)
 QUICK_NOISE_SAMPLES = 400
 """The noise is known to 2.5 % of itself."""
@@ -162,7 +172,10 @@ def effort_for(accuracy: float | None, predicted: Callable[[Effort], Prediction]
     speeds = next(
         (one for one in SPEED_EFFORTS if enough(predicted(Effort(speeds=one)).psi_f, PSI_MISFIT)), SPEED_EFFORTS[-1]
     )
-    return Effort(levels, rotation.SWUNG_S, QUICK_TURN_SHARE, True, (QUICK_ROTATION,), shots, speeds)
+    return Effort(
+        levels, turn_s=None, turn_share=QUICK_TURN_SHARE, quick=True, rotations=(QUICK_ROTATION,), shot_samples=shots,
+        speeds=speeds,
+    )  # fmt: skip
 
 
 def coasting_for(

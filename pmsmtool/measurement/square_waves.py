@@ -16,7 +16,7 @@ from pmsmtool.estimators.injection.axis_response import SKIP_SAMPLES
 from pmsmtool.estimators.injection.inductance import MINIMUM_PERIODS, ROTOR_LIMIT_RAD, rotor_way
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import square_injection
-from pmsmtool.experiments.rotation import SWUNG_S, turn_vector
+from pmsmtool.experiments.rotation import turn_vector
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
@@ -260,7 +260,7 @@ class SquareStage:
     def _turn(self, plan: square_injection.SquarePlan, start_rad: float, end_rad: float) -> None:
         """Turn the bias to an angle, and wait for it."""
         turn_s = max(FURTHER_TURN_S, QUARTER_TURN_S * abs(end_rad - start_rad) / (0.5 * math.pi))
-        turn_vector(self.drive, plan.bias_d_a, start_rad, end_rad, SWUNG_S if self.quick else turn_s)
+        turn_vector(self.drive, plan.bias_d_a, start_rad, end_rad, None if self.quick else turn_s)
         square_injection.hold_bias(self.drive, replace(plan, angle_rad=end_rad))
 
     def _rotor(self, encoder: EncoderResult, vector_rad: float) -> float:

@@ -19,7 +19,6 @@ from pmsmtool.experiments.rotation import (
     REST_LIMIT_S,
     STUCK_S,
     SWING,
-    SWUNG_S,
     RotationPlan,
     come_to_rest,
     rising,
@@ -217,7 +216,7 @@ def test_the_largest_current_is_not_trusted_where_it_puts_a_jumping_rotor_beside
 def test_a_rotor_swings_onto_its_vector_whatever_its_inertia(swing_rad_s: float, way_rad: float) -> None:
     """It says itself how long a turn takes: half a swing per sixth of a turn. Seen 1 to 8 degrees afterwards."""
     drive = SwingingRotor(swing_rad_s)
-    told = turn_vector(drive, 1.0, 0.0, way_rad, SWUNG_S)  # type: ignore[arg-type]
+    told = turn_vector(drive, 1.0, 0.0, way_rad, None)  # type: ignore[arg-type]
     swings = drive.elapsed * swing_rad_s / math.pi
     parts = abs(way_rad) / math.radians(60.0)
     assert drive.vector == way_rad and told <= drive.elapsed
@@ -229,5 +228,5 @@ def test_a_rotor_swings_onto_its_vector_whatever_its_inertia(swing_rad_s: float,
 
 def test_a_rotor_that_friction_holds_is_not_waited_for() -> None:
     drive = SwingingRotor(30.0)
-    turn_vector(drive, 0.5 * FRICTION, 0.0, math.radians(60.0), SWUNG_S)  # type: ignore[arg-type]
+    turn_vector(drive, 0.5 * FRICTION, 0.0, math.radians(60.0), None)  # type: ignore[arg-type]
     assert drive.theta == 0.0 and STUCK_S < drive.elapsed < 2.0 * STUCK_S + 10.0 * FRAME_S
