@@ -350,6 +350,11 @@ class _Learner:
                 f"the EMF takes {100 * shown.share:.2g} % of the current of torque pulses, "
                 f"{100 * (shown.at_once or 0.0):.0f} % of it flows at once"
             )
+        else:
+            self.notes.append(
+                f"torque pulses at {limit_a:.3g} A contradict the motor file, or did not last: what the EMF takes from "
+                "the current is taken from R, L and psi of the file, in a wide interval"
+            )
         guard.enable()
 
     def _taken(self, speeds: Sequence[float]) -> Trace:

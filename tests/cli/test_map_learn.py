@@ -7,9 +7,11 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 
 from pmsmtool.bus.connect import connect
@@ -32,6 +34,7 @@ from pmsmtool.measurement.learned_rows import MeasuredRow, with_measured
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.node.node import Node
+from pmsmtool.trace import Trace
 from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import COMMON, HEARTBEAT, Row, identity, write_eds
 
@@ -352,3 +355,20 @@ def test_a_gain_is_changed_only_while_the_voltage_is_off(bench: Bench) -> None:
             assert bench.counts() == (before[0] - 100, before[1])
         assert bench.counts() == before
         drive.close()
+
+
+def test_torque_pulses_that_contradict_the_motor_file_are_told() -> None:
+    """The assumed share of the EMF was kept without a word."""
+    t = np.arange(0.0, 1.0, 1e-3)
+    still = Trace(t, {"i_q_a": np.full(t.size, 0.1)}, {"i_q_a": "A"}, {"steps": [(0.0, 10.0), (0.5, 50.0)]})
+    done: list[str] = []
+    learner: Any = object.__new__(learn_gains._Learner)
+    learner.guard = SimpleNamespace(
+        limit_current=lambda limit_a: limit_a, quick_stop=lambda: done.append("off"), enable=lambda: done.append("on")
+    )
+    learner.drive, learner.emf, learner.notes = SimpleNamespace(current_count_a=0.01), Emf(0.01, 100.0, 0.007), []
+    learner.low, learner.span, learner.bandwidth, learner.settle_s = 10.0, 100.0, 20.0, 0.1
+    learner.step_current_a, learner._taken = (0.1, 1.0), lambda speeds: still
+    learner._show_current_loop(1.0)
+    assert learner.emf == Emf(0.01, 100.0, 0.007) and done == ["off", "on"]
+    assert ["torque pulses at 1 A" in note for note in learner.notes] == [True]
