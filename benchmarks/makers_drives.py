@@ -46,8 +46,6 @@ from pmsmtool.sim.foreign.file_rows import MakersObjects, read_makers_objects
 from pmsmtool.sim.simulated_machine import settings_of
 
 TOLD = ("J_per_psi", "J_per_kt")
-POLES = ("0x2350:03",)
-"""Objects without whose number a drive does not commutate: Faulhaber takes 2 or 4 poles."""
 SAME = (("copley", "dchcan"), ("elmo-gold-a", "elmo-gold-b", "elmo-gold-c"))
 """Files of one drive: they count once."""
 COUNTS = 1.0
@@ -106,8 +104,7 @@ def truth_of(machine: MachineFile) -> dict[str, float]:
 
 def too_much_for(objects: MakersObjects, machine: MachineFile) -> bool:
     """Return whether the drive cannot hold the motor's poles by the file's limits; currents may be cut."""
-    drive = ForeignDrive(objects, set_up_of(machine))
-    return any("cannot hold" in line and line.startswith(POLES) for line in drive.assumed)
+    return bool(ForeignDrive(objects, set_up_of(machine)).too_few_poles)
 
 
 def machines_for(objects: MakersObjects, name: str, first: int) -> Iterator[tuple[str, MachineFile]]:

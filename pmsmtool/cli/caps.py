@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.drive_access import LOOKING_S, map_option, open_node, read_map, rehearsal_bus
-from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
+from pmsmtool.cli.options import FILE, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
 from pmsmtool.plain_text import by_reason
 
@@ -25,13 +25,15 @@ if TYPE_CHECKING:
         "pmsmtool -i pmsmsim -c 'interior-2k2?drive=epos4' caps",
         "pmsmtool -i socketcan -c can0 -n 5 caps --map my-drive.toml --json",
         "pmsmtool caps --eds maker.eds",
+        "pmsmtool caps motor.toml --eds maker.eds",
     ),
 )
+@click.argument("machine", required=False, type=FILE)
 @click.option("--eds", metavar="FILE", help="Ask no drive: what a drive with the objects of this EDS or DCF allows.")
 @map_option
 @bus_options
 @output_options
-def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str | None) -> None:
+def caps_command(bus: BusOptions, out: Output, machine: Path | None, map_file: Path | None, eds: str | None) -> None:
     """Show for every quantity the methods, the interval to expect, and what this drive lacks.
 
     The drive is only read. Without --map the map for its vendor and product is used; without such a map the objects of
@@ -39,16 +41,21 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
     is printed.
 
     With --eds no bus is needed: a simulated drive with the objects of the file is asked, with a motor set up in it.
+    MACHINE, a machine file or profile, is that motor, and what of it the drive cannot hold is named.
     """
     from pmsmtool.drive_maps.shipped_maps import GENERIC, kin_of
     from pmsmtool.flash.map_gate import other_drive, unknown_firmware
+    from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.measurement.capabilities import examine
     from pmsmtool.params.catalogue import BY_NAME
     from pmsmtool.sim.foreign.drive import assumptions_of
 
     given = None if map_file is None else read_map(map_file)
+    if machine is not None and eds is None:
+        raise click.UsageError("give MACHINE with --eds FILE alone: a drive on the bus has its own motor")
     if eds is not None:
-        bus = rehearsal_bus(bus, eds=eds)
+        bus = rehearsal_bus(bus, eds=eds, machine=machine)
+        assumed = assumptions_of(eds, None if machine is None else load_machine_file(machine))
     with open_node(bus, within_s=LOOKING_S) as node:
         found = examine(node, given, may_try=eds is not None)
     out.result("caps", _facts(found), lambda: _lines(found, out.verbosity > 0, asked=eds is None))
@@ -57,7 +64,7 @@ def caps_command(bus: BusOptions, out: Output, map_file: Path | None, eds: str |
             out.detail(f"not written: {name}: {why}")
     if eds is not None:
         out.note(f"no drive was asked: this is what the objects of {eds} allow once a motor is set up")
-        for line in assumptions_of(eds):
+        for line in assumed:
             out.warn(f"{eds}: {line}")
     if given is not None and given.name != GENERIC and not found.map_is_drives:
         differ = other_drive(given, found.identity.vendor, found.identity.product, found.identity.doubt)

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
-from pmsmtool.commissioning.compared_stage import check_accepted, compared, refusal
+from pmsmtool.commissioning.compared_stage import check_accepted, compared, contradicted_unmoved, refusal
 from pmsmtool.commissioning.contradiction import DATA_SHEET
 from pmsmtool.commissioning.design_stages import within_ratings
 from pmsmtool.commissioning.level_stages import LevelStages
@@ -262,8 +262,9 @@ class Commissioning:
         start = clock.now()
         try:
             self.progress.begin(name, number, len(STAGES))
-            stage = replace(self._steps()[name](), seconds=clock.now() - start)
-            if name == "identify":
+            unmoved = contradicted_unmoved(self.drive, self.nameplate, self._found) if name == "identify" else None
+            stage = replace(unmoved or self._steps()[name](), seconds=clock.now() - start)
+            if name == "identify" and unmoved is None:
                 stage = self._compared(self._without_map(stage))
         except BaseException as error:
             if isinstance(error, NotAvailable) and (not self.stages.whole or name in self.stages.unavailable()):
@@ -309,8 +310,11 @@ class Commissioning:
     @property
     def stages(self) -> LevelStages:
         """The stages at the capability level of the drive."""
-        found = self.capabilities or reference_capabilities(self.drive.identity)
-        return LevelStages(self.run, self.drive, found, self.nameplate, self.drive_bandwidth_hz)
+        return LevelStages(self.run, self.drive, self._found, self.nameplate, self.drive_bandwidth_hz)
+
+    @property
+    def _found(self) -> Capabilities:
+        return self.capabilities or reference_capabilities(self.drive.identity)
 
     def _say(self, line: str) -> None:
         """Tell a line, and the account of the run what it is about."""

@@ -7,19 +7,22 @@ import contextlib
 from collections.abc import Collection
 from dataclasses import replace
 
-from pmsmtool.commissioning.contradiction import ACCEPTABLE, DATA_SHEET, HELD, ORDER, RATIO, compare
+from pmsmtool.commissioning.contradiction import ACCEPTABLE, DATA_SHEET, EXACT, HELD, ORDER, RATIO, compare
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.motion_objects import ENCODER_COUNTS, MOTOR_TURNS
 from pmsmtool.drive.standard_drive import RecorderDrive
 from pmsmtool.errors import ConfigError, Contradiction, SafetyRefusal, SdoAbort
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.identification.request import Method
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
+from pmsmtool.measurement.capabilities import Capabilities
 from pmsmtool.params.parameter_set import default_set
 from pmsmtool.report.comparison import contradictions
 from pmsmtool.run_directory import RunDirectory, Stage
 
 CONTRADICTS = "machine file, drive and measurement contradict each other; nothing was written"
+UNMOVED = "machine file and drive contradict each other; nothing was moved, nothing was written"
 LEAST_COUNTS = 64
 """Fewer increments per turn are a drive's unset 0x608F (1 : 1), not an encoder's."""
 _KEYS = {"encoder_counts": "[encoder] bits", "J_per_psi": "J_kgm2 or psi_f_wb", "L_phase_h": "L_d_h and L_q_h"}
@@ -111,6 +114,21 @@ def compared(
     return replace(stage, status="fail", note="\n".join([*lines, *([stage.note] if stage.note else [])]))
 
 
+def contradicted_unmoved(drive: CanopenDrive, known: MachineFile | None, found: Capabilities) -> Stage | None:
+    """Return the identification stage failed before anything moves; None where nothing is known to contradict.
+
+    That is what no measurement of this drive could tell, and the drive commutates by: its encoder counts, and its pole
+    pairs where no method of it gives them.
+    """
+    if known is None:
+        return None
+    poles = any(row.available for row in found.rows() if row.quantity == "poles" and row.method != Method.MANUAL)
+    held = {key: n for key, n in held_values(drive).items() if key in EXACT and not (poles and key == "pole_pairs")}
+    rows = [row.facts() for row in compare(known, held, [])]
+    wrong = [str(row["text"]) for row in contradictions(rows)]
+    return Stage("identify", "fail", 0.0, note="\n".join(wrong), comparison=rows) if wrong else None
+
+
 def refuse_inertia(known: MachineFile, ratio: Estimate, run: RunDirectory) -> None:
     """Refuse J over psi of moves that is less than MACHINE allows; a load may add any amount.
 
@@ -135,12 +153,14 @@ def refusal(stage: Stage, run: RunDirectory) -> Contradiction | None:
         return None
     names = [str(row["name"]) for row in wrong]
     hint = f"correct {', '.join(_KEYS.get(name, name) for name in names)} in the machine file and begin a new run"
+    if not stage.values:
+        hint = hint.replace("machine file", "machine file, or set the drive up for this motor,")
     if any(row["source"] != DATA_SHEET for row in wrong):
         hint = "give a machine file of this motor (`pmsmtool machine new` writes one) and begin a new run"
     elif all(name in ACCEPTABLE for name in names):
         hint += f"; or, knowing why, add {' '.join(f'--accept-contradiction {name}' for name in names)}"
     return Contradiction(
-        "\n  - ".join([CONTRADICTS, *(str(row["text"]) for row in wrong)]),
+        "\n  - ".join([CONTRADICTS if stage.values else UNMOVED, *(str(row["text"]) for row in wrong)]),
         where=str(run.path),
         likely="; ".join(dict.fromkeys(str(row["cause"]) for row in wrong if row["cause"])),
         hint=hint,

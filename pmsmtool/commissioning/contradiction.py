@@ -90,6 +90,7 @@ _SHAFT = "a load on the shaft (--shaft coupled), or the data sheet of another mo
 _BY_POLE_PAIRS = "the pole pairs, which it is computed with"
 _RATIO = "J, psi or pole pairs of another motor, or a load on the shaft (--shaft coupled)"
 _OTHER = "the data sheet of another motor"
+_OTHER_SET_UP = "the drive is set up for another motor, or this is the data sheet of another one"
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,7 +354,7 @@ def _exact(row: Row, *, used: bool) -> Row:
     elif ratio == 2.0:
         cause = "ratio 2: poles instead of pole pairs, or encoder counts per turn"
     else:
-        cause = _OTHER
+        cause = _OTHER_SET_UP if row.measured is None else _OTHER
     return replace(row, verdict="contradicts", cause=cause)
 
 

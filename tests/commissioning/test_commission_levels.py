@@ -257,6 +257,8 @@ def test_a_file_of_other_pole_pairs_than_the_drive_holds_writes_nothing(tmp_path
         assert DriveParameters(drive.node).read(names) == before and not person.shown
         assert is_safe(drive.node.state())
     assert ended.value.exit_code == 1 and "--accept" not in ended.value.hint
+    assert "nothing was moved" in ended.value.what and not list(run.path.glob("traces/*"))
+    assert "set the drive up for this motor" in ended.value.hint and "set up for another" in ended.value.likely
     assert not (run.path / "design.toml").exists()
     rows = {row["name"]: row for row in run.read().stage("identify").comparison}  # type: ignore[union-attr]
     assert (rows["pole_pairs"]["stated"], rows["pole_pairs"]["held"]) == (7, 3)

@@ -7,14 +7,17 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
-from pmsmtool.commissioning.compared_stage import check_accepted
+from pmsmtool.commissioning import compared_stage
+from pmsmtool.commissioning.compared_stage import check_accepted, contradicted_unmoved
 from pmsmtool.commissioning.contradiction import ACCEPTABLE, HELD, OTHER_MOTOR, Row, compare
 from pmsmtool.errors import ConfigError, SafetyRefusal
 from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.measurement.capabilities import reference_capabilities
 from pmsmtool.params.parameter_set import default_set
 from pmsmtool.report.comparison import headline, marks, table_cells, unchecked
 from pmsmtool.report.report import verdict_of
@@ -237,6 +240,21 @@ def test_a_memory_of_another_motor_checks_nothing_of_what_was_refused() -> None:
     assert wrong(compare(TRUTH, other, [])) == [*other]
     only = [v for v in measured() if v["name"] == "R_s_ohm"]
     assert wrong(compare(TRUTH, other, only, used=("pole_pairs",))) == ["pole_pairs"]
+
+
+def test_only_what_no_measurement_could_tell_is_compared_before_anything_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A reference drive measures its pole pairs, and may hold those of another motor; nothing measures the counts."""
+    held = {"pole_pairs": 7.0, "R_s_ohm": 50.0, "encoder_counts": 4096.0}
+    monkeypatch.setattr(compared_stage, "held_values", lambda _: held)
+    whole = reference_capabilities(Mock())
+    blind = replace(whole, features=frozenset())
+    for capabilities, names in ((whole, ["encoder_counts"]), (blind, ["pole_pairs", "encoder_counts"])):
+        stage = contradicted_unmoved(Mock(), TRUTH, capabilities)
+        assert stage is not None and stage.status == "fail"
+        assert [row["name"] for row in stage.comparison if row["verdict"] == "contradicts"] == names
+    assert contradicted_unmoved(Mock(), None, whole) is None
+    held.pop("encoder_counts")
+    assert contradicted_unmoved(Mock(), TRUTH, whole) is None
 
 
 def test_a_value_that_is_hardly_known_checks_nothing() -> None:

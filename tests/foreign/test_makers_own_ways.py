@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -98,7 +99,27 @@ def test_a_drive_that_is_off_and_takes_no_controlword_is_off(tool: Tool) -> None
 def test_what_the_drive_cannot_hold_is_said(tool: Tool) -> None:
     rows = tuple(row for row in faulhaber() if row[0] != 0x608F)
     code, said = commissioned(tool, (*rows, (0x608F, 1, "U32", "rw", "2048")), {(0x608F, 1): (1, 65535)})
-    assert code == 10 and "x.eds: 0x608F:01 holds" in said and "this motor needs 131072" in said, said
+    assert code == 10 and "x.eds: 0x608F stays 65535 / 1, this motor's encoder has 131072" in said, said
+
+
+def test_a_motor_of_more_poles_than_the_drive_holds_is_refused_first(tool: Tool) -> None:
+    """Before, the rehearsal moved it with the largest number allowed, and FAIL blamed the data sheet."""
+    write_eds(Path("x.eds"), faulhaber(), {(0x2350, 3): (2, 4)})
+    for command in (("caps", str(machine_path(PROFILE))), ("--yes", "commission", str(machine_path(PROFILE)))):
+        code, printed, said = tool(*command, "--eds", "x.eds")
+        assert code == 9 and not printed and not Path("runs").exists(), said
+        assert "cannot commutate this motor of 3 pole pairs: 0x2350:03 (" in said and "takes 2 to 4" in said
+        assert "this motor needs 6" in said and "where:  x.eds" in said and "try:" in said
+    assert tool("caps", "--eds", "x.eds")[0] == 0
+    code, _, said = tool("caps", str(machine_path(PROFILE)))
+    assert code == 2 and "a drive on the bus has its own motor" in said
+
+
+def test_currents_that_the_drive_does_not_hold_are_named_by_the_makers_words(tmp_path: Path) -> None:
+    small = write_eds(tmp_path / "x.eds", faulhaber(), {(0x2333, 1): (0, 900), (0x2333, 2): (60_000, 65_000)})
+    told = "\n".join(assumptions_of(str(small), load_machine_file(machine_path(PROFILE))))
+    assert re.search(r"0x2333:01 \(\S.*\) takes 0 to 900, .* needs 6\d{3}: 900 is set, .* smaller motors", told), told
+    assert re.search(r"0x2333:02 .* needs 12\d{3}: 60000 is set, likely a drive for larger motors", told), told
 
 
 def test_a_motor_is_rehearsed_without_an_encoder_that_the_drive_cannot_count(tmp_path: Path) -> None:

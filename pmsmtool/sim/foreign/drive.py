@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import Schedule, Timer
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.families import (
@@ -56,6 +56,7 @@ REVISION = 3
 PID_MARKS = {(0x30A1, 3), (0x60FB, 3)}
 """Gain of the derivative, by which one controller of the position is known."""
 SERIAL = (0x1018, 4)
+ENCODER = (0x608F, 1)
 
 _MS = 1_000_000
 TOGGLE = 0x80
@@ -81,6 +82,8 @@ class ForeignDrive:
         What the simulated drive does that neither file nor standard says.
     unheld : tuple of str
         What of the motor the file's own limits do not let be entered, one line each.
+    too_few_poles : str
+        Why the drive cannot commutate the motor: the object of the poles and its limits; empty where it can.
     set_up : SetUp
         The motor, with no more rated current than the drive's object of it holds.
     behind : Behind or None
@@ -102,17 +105,20 @@ class ForeignDrive:
         own = [f"0x{law.index:04X}:{law.sub:02X} {law.source}" for law in self.laws.values() if "assumed" in law.source]
         blank = [] if all(stated) else [f"0x1018 blank in the file: taken as {self.vendor_product}"]
         reaction = [] if objects.has((0x6007, 0)) else ["no 0x6007: a lost master is a fault (0x605E), voltage off"]
-        unheld = [
-            f"0x{law.index:04X}:{law.sub:02X} holds {low:.0f} to {high:.0f}, this motor needs {law.set_up:.0f}"
-            for law in self.laws.values()
-            for low, high in [objects.rows[law.index, law.sub].bounds]
-            if law.set_up is not None and not low <= law.set_up <= high
-        ]
+        outside = {law: line for law in self.laws.values() if (line := _outside(objects, law))}
+        self.too_few_poles = next((line for law, line in outside.items() if law.commutates), "")
+        unheld = [line for law, line in outside.items() if not law.commutates and (law.index, law.sub) != ENCODER]
         if not _holds_encoder(objects, set_up):
             counted = f"{encoder_resolution(objects, set_up.counts):.0f} / {max(1, objects.stored(0x608F, 2))}"
-            unheld.append(f"0x608F stays {counted}, this motor's encoder has {set_up.counts}: that is not compared")
+            unheld.append(
+                f"0x608F stays {counted}, this motor's encoder has {set_up.counts}: the motor is rehearsed with the "
+                "encoder of the drive, and that is not compared"
+            )
         if set_up != stated_motor:
-            unheld.append(f"rated current cut to the drive's {set_up.i_nom_apk:.4g} A peak")
+            unheld.append(
+                f"rated current cut from {stated_motor.i_nom_apk:.4g} to {set_up.i_nom_apk:.4g} A peak, the largest "
+                "rated current that this drive holds"
+            )
         self.unheld = tuple(unheld)
         self.assumed = (*objects.assumed, *own, *blank, *reaction, *unheld)
         self.behind: Behind | None = None
@@ -211,7 +217,7 @@ def assumptions_of(file: str, machine_file: MachineFile | None = None) -> tuple[
     before them stands how odd lines of the file are read.
 
     Raises ConfigError: as ``file_rows.read_makers_objects``; or, with a motor, the file is that of the reference drive,
-    which is simulated itself.
+    which is simulated itself; NotAvailable: the drive's own object of the poles does not hold the motor's.
     """
     objects = read_makers_objects(file)
     if machine_file is not None and objects.stored(0x1018, 1) == VENDOR:
@@ -224,7 +230,18 @@ def assumptions_of(file: str, machine_file: MachineFile | None = None) -> tuple[
     lines = objects.odd + (
         (f"0x6502 is blank: modes {modes} are assumed by its objects; a real drive reports its own",) if assumed else ()
     )
-    return (*lines, *(() if machine_file is None else ForeignDrive(objects, set_up_of(machine_file)).unheld))
+    if machine_file is None:
+        return tuple(lines)
+    drive = ForeignDrive(objects, set_up_of(machine_file))
+    if drive.too_few_poles:
+        raise NotAvailable(
+            f"this drive cannot commutate this motor of {set_up_of(machine_file).pole_pairs} pole pairs: "
+            f"{drive.too_few_poles}",
+            where=file,
+            likely="the drive is made for other motors, or pole_pairs of MACHINE counts poles",
+            hint="take the file of another drive, or correct pole_pairs in MACHINE",
+        )
+    return (*lines, *drive.unheld)
 
 
 def rehearsed_motor(path: Path, file: str | None) -> MachineFile:
@@ -241,6 +258,19 @@ def _holds_encoder(objects: MakersObjects, set_up: SetUp) -> bool:
     """Whether the drive counts the encoder that the motor has."""
     counts = encoder_resolution(objects, set_up.counts) / max(1, objects.stored(0x608F, 2))
     return not objects.has((0x608F, 1)) or counts == set_up.counts
+
+
+def _outside(objects: MakersObjects, law: Law) -> str:
+    """Say what an object takes and the motor needs, by the maker's own name of it; nothing where it holds that."""
+    row = objects.rows[law.index, law.sub]
+    low, high = row.bounds
+    if law.set_up is None or low <= law.set_up <= high:
+        return ""
+    named = f"0x{law.index:04X}:{law.sub:02X} ({row.name}) takes {low:.0f} to {high:.0f}, this motor needs "
+    if law.commutates:
+        return f"{named}{law.set_up:.0f}"
+    size = "smaller" if law.set_up > high else "larger"
+    return f"{named}{law.set_up:.0f}: {min(max(law.set_up, low), high):.0f} is set, likely a drive for {size} motors"
 
 
 def _within(objects: MakersObjects, set_up: SetUp) -> SetUp:

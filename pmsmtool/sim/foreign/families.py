@@ -39,6 +39,8 @@ class Law:
         Returns the counts it shows.
     act : callable or None
         Takes the counts that are written.
+    commutates : bool
+        Whether the drive commutates by it, so that no other number will do.
     """
 
     index: int
@@ -47,6 +49,7 @@ class Law:
     set_up: float | None = None
     show: Callable[[Behind], float] | None = None
     act: Callable[[Behind, float], None] | None = None
+    commutates: bool = False
 
 
 TENTH_OF_DEGREE, RPM, RPS = 0xFF41, 0xB447, 0xB403
@@ -251,7 +254,7 @@ def _epos4(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     rated_ma, constant = round(1000.0 * motor.i_nom_apk), round(1e6 * motor.torque_constant)
     yield Law(0x3001, 1, PEAK_ASSUMED, set_up=rated_ma)
     yield _limit(0x3001, 2, 1000.0, motor.i_max_apk, PEAK_ASSUMED)
-    yield Law(0x3001, 3, "pole pairs", set_up=motor.pole_pairs)
+    yield Law(0x3001, 3, "pole pairs", set_up=motor.pole_pairs, commutates=True)
     yield Law(0x3001, 5, "uN m/A", set_up=constant)
     yield Law(0x3010, 1, "pulses, four counts each", set_up=motor.counts / 4.0)
     yield Law(0x6076, 0, "uN m", set_up=rated_ma * constant / 1000.0)
@@ -274,7 +277,7 @@ def _epos2(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     """Current mode -3 takes 0x2030; currents are mA, not shares of a rated one."""
     yield Law(0x6410, 1, PEAK_ASSUMED, set_up=1000.0 * motor.i_nom_apk)
     yield _limit(0x6410, 2, 1000.0, motor.i_max_apk, PEAK_ASSUMED)
-    yield Law(0x6410, 3, "pole pairs", set_up=motor.pole_pairs)
+    yield Law(0x6410, 3, "pole pairs", set_up=motor.pole_pairs, commutates=True)
     yield Law(0x6410, 4, "rpm", set_up=motor.n_max_rpm, act=lambda behind, n: behind.limit_speed(n))
     yield Law(0x2210, 1, "pulses, four counts each", set_up=motor.counts / 4.0)
     yield _current(0x6078, 0, 1000.0, PEAK_ASSUMED)
@@ -295,7 +298,7 @@ def _copley(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     yield _limit(0x2110, 0, 100.0, motor.i_max_apk, source)
     yield Law(0x2111, 0, source, set_up=100.0 * motor.i_nom_apk)
     yield Law(0x2112, 0, source, set_up=1000.0)
-    yield Law(0x6410, 2, source, set_up=motor.pole_pairs)
+    yield Law(0x6410, 2, source, set_up=motor.pole_pairs, commutates=True)
     yield Law(0x6410, 7, source, set_up=2.0 * motor.R_s_ohm / 0.01)
     yield Law(0x6410, 8, source, set_up=2.0 * motor.L_q_h / 1e-5)
     yield Law(0x6410, 12, source, set_up=motor.torque_constant / 1e-5)
@@ -309,7 +312,7 @@ def _copley(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
 
 def _nanotec(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     source = f"mA; rms {ASSUMED}"
-    yield Law(0x2030, 0, "pole pairs", set_up=motor.pole_pairs)
+    yield Law(0x2030, 0, "pole pairs", set_up=motor.pole_pairs, commutates=True)
     yield _limit(0x2031, 0, 1000.0 * RMS, motor.i_max_apk, source)
     yield Law(0x203B, 1, source, set_up=1000.0 * RMS * motor.i_nom_apk)
     yield Law(0x2039, 1, source, show=lambda behind: 1000.0 * RMS * behind.i_d_a())
@@ -321,7 +324,7 @@ def _faulhaber(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     yield Law(0x2333, 1, PEAK_ASSUMED, set_up=1000.0 * motor.i_nom_apk)
     yield _limit(0x2333, 2, 1000.0, motor.i_max_apk, PEAK_ASSUMED)
     yield _current(0x6078, 0, 1000.0, PEAK_ASSUMED)
-    yield Law(0x2350, 3, "poles", set_up=2.0 * motor.pole_pairs)
+    yield Law(0x2350, 3, "poles", set_up=2.0 * motor.pole_pairs, commutates=True)
 
 
 def _none(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
