@@ -98,7 +98,8 @@ def _conclude(out: Output, found: list[Finding], stated_by: str = "") -> None:
         )  # fmt: skip
     unseen = [finding.looked_at for finding in found if finding.verdict in (NOT_SEEN, NOT_CHECKED)]
     if any(name in unseen for name in ("phases", "shaft", "pole pairs")):
-        raise Partial(f"not judged: {', '.join(unseen)}", hint="this drive does not show them; look at them yourself")
+        by_hand = "see the table for the reason; by hand: leads with an ohmmeter, pole pairs on the name plate"
+        raise Partial(f"not judged: {', '.join(unseen)}", hint=by_hand)
 
 
 def _examined(bus: BusOptions, map_file: Path | None) -> Capabilities:

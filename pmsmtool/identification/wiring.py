@@ -58,7 +58,7 @@ SIGN_FOUND = f"{SIGN_BY}; identify finds the sign by itself and sets it"
 POLARITY_BY = f"the polarity of the position (0x607E), or {SIGN_BY}"
 FALLS = "the position falls under positive torque"
 OPEN_BY = "an open phase, or the supply in current limit; where the shaft turns all the same, what shows the current"
-SIGN_BY = "the object that shows the current has the other sign, or shows magnitudes (0x6078, 0x6077, or the map's)"
+SHOWN_BY = "the object that shows the current has the other sign, or shows magnitudes (0x6078, 0x6077, or the map's)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,7 +283,7 @@ def _sign_shown(shares: NDArray[np.float64], commands: NDArray[np.float64]) -> l
     if min(abs(forth), abs(back)) < LEAST_CURRENT or min(forth, back) > 0.0:
         return []
     seen = f"of a positive current {100.0 * forth:.2g} % is shown, of a negative one {100.0 * back:.2g} %"
-    return [Finding("current sensors", WRONG, seen, SIGN_BY)]
+    return [Finding("current sensors", WRONG, seen, SHOWN_BY)]
 
 
 def _given(pulses: Sequence[Trace], commands: Sequence[float]) -> NDArray[np.float64]:

@@ -14,9 +14,9 @@ import pytest
 
 from benchmarks.random_drives import draw_drive
 from pmsmtool.commissioning.first_check_levels import _supply as link_row
-from pmsmtool.commissioning.first_check_levels import beyond, judge_kept
+from pmsmtool.commissioning.first_check_levels import beyond, judge_kept, unmoved
 from pmsmtool.drive.port import Drive
-from pmsmtool.errors import LimitExceeded
+from pmsmtool.errors import IdentificationError, LimitExceeded
 from pmsmtool.experiments.first_turn import WAY_RAD, push_forth_and_back
 from pmsmtool.identification.by_pulses import NO_LINK, no_link
 from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG, judge_current, judge_pulses, judge_push
@@ -155,6 +155,15 @@ def test_a_slow_current_loop_does_not_push_the_shaft_further() -> None:
 def test_a_limit_is_about_what_it_shows(quantity: str, turns: bool, about: str, verdict: str) -> None:
     row = beyond(LimitExceeded(quantity, 2.0, 1.0, "A"), turns)
     assert (row.looked_at, row.verdict) == (about, verdict)
+
+
+def test_a_shaft_that_little_current_does_not_move_is_not_held() -> None:
+    """A motor of 48 A behind an EPOS2 of 5 A: a tenth of 5 A is 1.5 % of its current, and `shaft` was WRONG."""
+    error = IdentificationError("E_EXCITATION", "the shaft does not move", likely="a closed brake")
+    held, unseen = unmoved(error, False, 0.1), unmoved(error, False, 0.015)
+    assert held.verdict == unmoved(error, False, 0.072).verdict == WRONG and held.likely == "a closed brake"
+    assert unseen.verdict == NOT_SEEN and "1.5 % of the motor's rated current" in unseen.shown
+    assert unseen.likely.startswith("friction, for want of current: a small drive for this motor")
 
 
 @pytest.mark.chain

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -132,6 +133,17 @@ def test_a_motor_is_rehearsed_without_an_encoder_that_the_drive_cannot_count(tmp
     assert rehearsed_motor(stated, None).encoder.bits == 17 and rehearsed_motor(stated, str(fixed)).encoder.bits is None
     told = assumptions_of(str(fixed), load_machine_file(stated))
     assert any("0x608F stays 3000 / 1, this motor's encoder has 131072" in line for line in told)
+
+
+def test_the_supply_of_an_epos4_is_seen(tool: Tool) -> None:
+    """Its 0x2200:01 had no row in the map: `check` passed over half of the voltage, and psi was not available."""
+    write_eds(Path("x.eds"), (*epos4(), (0x2200, 1, "U16", "ro", "")))
+    code, printed, said = tool("caps", "--eds", "x.eds", "--json")
+    psi = [row for row in json.loads(printed)["quantities"] if (row["quantity"], row["method"]) == ("psi", "standard")]
+    assert code == 0 and psi[0]["available"], said
+    weak = f"{PROFILE}?nv=:memory:&eds=x.eds&U_dc_v=270"
+    code, printed, said = tool("--sim", weak, "--yes", "check", str(machine_path(PROFILE)))
+    assert code == 1 and "supply: DC link 270 V, 540 V are stated" in said, said
 
 
 def test_a_limit_that_only_takes_is_no_limit(tool: Tool) -> None:

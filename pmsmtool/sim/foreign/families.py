@@ -263,6 +263,7 @@ def _epos4(objects: MakersObjects, motor: SetUp) -> Iterator[Law]:
     for sub in (1, 2):
         yield _current(0x30D1, sub, 1000.0, PEAK_ASSUMED)
     yield _asked_current(0x30D0, 1000.0, PEAK_ASSUMED)
+    yield Law(0x2200, 1, "0.1 V: giafranchini/eposx_hardware", show=lambda behind: 10.0 * behind.U_dc_v())
     yield Law(
         0x30A0, 1, "uV/A", set_up=1e6 * motor.K_p_v_per_a,
         act=lambda behind, n: behind.set_gains(K_p_v_per_a=1e-6 * n),
