@@ -154,7 +154,7 @@ def _lines(found: Capabilities, sources: bool, *, asked: bool) -> list[str]:
     ``asked``: a drive was asked; else node and serial number are none.
     """
     identity = found.identity
-    who = f"{identity.name}  vendor {identity.vendor:#010x}  product {identity.product:#x}"
+    who = f"{identity.name}  vendor {identity.vendor:#010x}  product {identity.product:#x}".strip()
     lines = [
         f"node {identity.node}  {who}  serial {identity.serial}" if asked else who,
         f"map {found.drive_map.name} ({len(found.drive_map.cells)} parameters)  capability level {found.level}",

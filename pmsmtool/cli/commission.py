@@ -347,9 +347,6 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
         raise click.exceptions.Exit(int(ExitCode.PARTIAL))
 
 
-_OF_PARTIAL = "try: `pmsmtool caps` lists what this drive can measure; --require STAGE makes a missing stage exit 1"
-
-
 def _next_step(run: RunDirectory, error: BaseException) -> str:
     """Say what leads on: a run whose machine was not identified, or that this drive cannot do, begins anew."""
     from pmsmtool.errors import Contradiction, IdentificationError, NotAvailable
@@ -386,7 +383,9 @@ def _show(run: RunDirectory, out: Output, begun: float, *, ended: bool = False) 
         "comparison": [] if identified is None else list(identified.comparison),
     }
     report = f"report: {run.path / 'report.html'}"
-    advice = [_OF_PARTIAL] if found.kind == "partial" else []
+    caps = f"caps --sim '{record.bus['channel']}'" if found.simulated and record.bus.get("channel") else "caps"
+    more = f"`pmsmtool {caps}` lists what this drive can measure; --require STAGE makes a missing stage exit 1"
+    advice = [f"try: {more}"] if found.kind == "partial" else []
     lines = [*(f"  - {line}" for line in found.details), *advice, report, found.headline]
     if ended and not out.json:
         for line in (*lines[: len(found.details)], report, found.headline.splitlines()[0]):

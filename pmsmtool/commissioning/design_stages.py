@@ -199,8 +199,10 @@ def margins_stage(run: RunDirectory, request: MarginRequest) -> Stage:
         f"over {report.corners} corners and {report.samples} samples: phase {phase.worst:.1f} deg ({phase.name}), "
         f"gain {gain.worst:.1f} dB ({gain.name})"
     )
-    if beyond := [f"{spread.name} {spread.worst:.2g}" for spread in report.headroom if spread.unjudged]:
-        summary += f"; not judged: {', '.join(beyond)}"
+    beyond = [spread for spread in report.headroom if spread.unjudged]
+    if beyond:
+        shares = ", ".join(f"{spread.name.removeprefix('headroom_')} {spread.worst:.2g}" for spread in beyond)
+        summary += f"; headroom below 0 at a corner, not judged, reasons in the report: {shares}"
     values = [_spread_value(spread) for spread in (*report.loops, *report.headroom)]
     return _stage("margins", summary, criteria, values=values, files=(), fallbacks=report.notes)
 

@@ -338,6 +338,8 @@ def _refusal(why: str, stated: bool) -> IdentificationError:
     """
     name, _, text = why.partition(": ")
     reason, what = (name, text) if name.startswith("E_") else (NOT_TOLD, why)
+    if ": allow " in what:  # it says what to allow
+        return IdentificationError(reason, what, hint="" if stated else "state it in MACHINE")
     more = "allow more current and speed"
     return IdentificationError(reason, what, hint=more if stated else f"state it in MACHINE, or {more}")
 

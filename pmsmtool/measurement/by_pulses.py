@@ -52,7 +52,7 @@ from pmsmtool.identification.by_pulses import (
 )
 from pmsmtool.identification.request import IdentifyRequest, Method
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.measurement.capabilities import QUANTITIES, Capabilities
+from pmsmtool.measurement.capabilities import QUANTITIES, UNDECIDED, Capabilities
 from pmsmtool.measurement.limits import DURATION_S, Keep, Say, Task
 from pmsmtool.run_directory import Stage
 from pmsmtool.trace import Trace
@@ -270,7 +270,8 @@ def measurable(
             psi = "psi from the voltage of the coasting machine"
         elif found.row("psi", method).available:
             psi = "psi where the speed at the voltage limit is reached"
-        lines.append(f"J/psi, tau_c/psi from polled torque pulses; {psi}")
+        doubt = f" ({UNDECIDED}, a map of your own may say it: rated_current)" if found.current_undecided else ""
+        lines.append(f"J/psi, tau_c/psi from polled torque pulses{doubt}; {psi}")
     elif available and "mechanics" in asked:
         lines.append(OVER_TORQUE_CONSTANT)
     return lines

@@ -28,7 +28,9 @@ def commissioned(
     tool: Tool, rows: tuple[Row, ...], limits: dict[tuple[int, int], tuple[int, int]] | None = None
 ) -> tuple[int, str]:
     write_eds(Path("x.eds"), rows, limits)
-    code, _, said = tool("--yes", "commission", str(machine_path(PROFILE)), "--eds", "x.eds", "--speed-max", "400rpm")
+    machine = str(machine_path(PROFILE))
+    code, printed, said = tool("--yes", "commission", machine, "--eds", "x.eds", "--speed-max", "400rpm")
+    assert f"try: `pmsmtool caps --sim '{machine}?nv=:memory:&eds=x.eds'` lists" in printed, "it can be typed"
     return code, said
 
 

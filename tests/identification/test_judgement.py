@@ -153,6 +153,9 @@ def test_what_is_missing_is_refused_by_its_reason_and_nothing_at_all_fails(known
     assert judgement.verdicts.refused == {"R": f"{hidden} (try: allow more current and speed)"}
     alone = judged(found, {"R_s_ohm": "hidden by the inverter"}, ASKED, None)
     assert alone.verdicts.refused == {"R": f"{hidden} (try: state it in MACHINE, or allow more current and speed)"}
+    for machine in (known, None):  # "allow a larger --speed-max ... (try: allow more current and speed)"
+        (why,) = judged(found, {"R_s_ohm": "slow: allow 2 m/s"}, ASKED, machine).verdicts.refused.values()
+        assert why == "E_NOT_MEASURED: slow: allow 2 m/s" + ("" if machine else " (try: state it in MACHINE)")
     only = {"J_per_psi": estimates(known, J_per_psi=1.5)["J_per_psi"]}
     assert judged(only, {}, ("mechanics",), known).verdicts.status == "fail"
 

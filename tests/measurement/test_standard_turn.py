@@ -161,4 +161,8 @@ def test_dead_time_that_drives_the_swing_is_left_by_a_slower_turn(
 def test_the_plan_promises_psi_only_where_a_voltage_shows_it(seen: tuple[str, ...], says: str) -> None:
     features = frozenset({*WAYS["mechanics"][Method.STANDARD].needs, *seen})
     found = Capabilities(Identity(1, 0, 0, 0, 1), load_family("cia402"), False, features)
-    assert says in by_pulses.measurable(Method.STANDARD, found, load_machine_file("interior-2k2"))[-1]
+    known = load_machine_file("interior-2k2")
+    plan = by_pulses.measurable(Method.STANDARD, found, known)[-1]
+    assert says in plan and "peak or rms" not in plan
+    (doubtful,) = by_pulses.measurable(Method.STANDARD, replace(found, current_undecided=True), known)
+    assert says in doubtful and "peak or rms: +-17 % more, a map of your own may say it" in doubtful
