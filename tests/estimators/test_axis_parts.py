@@ -16,7 +16,7 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.injection import axis_layout, axis_response, output_error
 from pmsmtool.estimators.injection.axis_layout import Effects, Layout, Motion, Timing
 from pmsmtool.estimators.injection.axis_response import (
-    LINE_SHARE,
+    LINE_GAIN,
     SKIP_SAMPLES,
     Response,
     Shot,
@@ -260,8 +260,8 @@ def test_small_effects_are_those_of_a_simulation_in_small_steps(effect: str) -> 
     assert np.max(np.abs(off[30:-30])) < EFFECT * np.max(np.abs(change))
 
 
-def test_a_sine_that_most_of_the_residual_is_is_found() -> None:
-    """Amplitude against noise of one: from a fifth of the power on; on a harmonic of the injection it stays."""
+def test_a_sine_that_stands_out_of_the_residual_is_found() -> None:
+    """Share of the power against noise: of 230 samples from 60 on; on a harmonic of the injection it stays."""
     shot, n = _shot(), 230
     k = np.arange(n)
     noise = np.random.default_rng(23).standard_normal(n)
@@ -269,6 +269,7 @@ def test_a_sine_that_most_of_the_residual_is_is_found() -> None:
     injected = 1.0 / (12.0 * T_S)
     for hz, share, found in (
         (5.37 * injected, 0.5, True),
+        (5.37 * injected, 0.33, True),
         (5.37 * injected, 0.12, False),
         (3.0 * injected, 0.9, False),
     ):
@@ -281,7 +282,7 @@ def test_a_sine_that_most_of_the_residual_is_is_found() -> None:
             assert len(again.lines_hz) == 2
     flat = np.zeros(n)
     flat[0] = 1.0  # a share of nothing: its power is spread over all frequencies
-    assert with_line(shot, flat) is shot and LINE_SHARE == 0.2
+    assert with_line(shot, flat) is shot and LINE_GAIN == 60.0
 
 
 def test_the_first_guess_is_the_voltage_over_the_slope() -> None:

@@ -333,8 +333,6 @@ def _fitted(
                 shots[axis], sigma_a, R_ohm, torque=axis == "q", motion=motion, other=fits.get("d") if axis == "q"
                 else None, instant=instant,
             )  # fmt: skip
-            if not CHI2_REFUSE < fits[axis].chi2:
-                break
             found = [with_line(shot, r) for shot, r in zip(shots[axis], fits[axis].residuals, strict=True)]
             if all(new is old for new, old in zip(found, shots[axis], strict=True)):
                 break
