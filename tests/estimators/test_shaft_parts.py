@@ -23,7 +23,7 @@ from pmsmtool.estimators.shaft import frequency_response as fr
 from pmsmtool.estimators.shaft import mechanics, position, response_lines
 from pmsmtool.estimators.shaft.disturbances import Disturbances
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult
-from pmsmtool.estimators.shaft.model import Problem, Run, fastest, largest_torque, sizes_of, whitener
+from pmsmtool.estimators.shaft.model import Problem, Run, fastest, largest_torque, positions, sizes_of, whitener
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
@@ -175,14 +175,14 @@ def test_mean_motions_are_a_weighted_regression_of_mean_torques(power: float) ->
     for a, w in ((40.0, 1.0), (-15.0, 9.0), (-35.0, -2.0), (12.0, -8.0)):
         t = 0.01 * np.arange(41)
         theta = 0.2 + w * t + 0.5 * a * t**2
-        torque = rng.uniform(0.05, 0.1, 40) * np.sign(a)
-        runs.append(_run(theta, torque, 0.01))
+        torque = rng.uniform(0.05, 0.1) * np.sign(a)
+        runs.append(_run(theta, np.full(40, torque), 0.01))
         way = np.abs(np.diff(theta))
         moving = max(16, int(np.nonzero(way > 0.2 * np.max(way))[0][-1]) + 1)
         for part in (slice(0, moving // 2), slice(moving // 2, moving)):
             omega = w + a * float(np.mean(t[part]))
             rows.append([a, omega, math.copysign(1.0, omega)])
-            torques.append(float(np.mean(torque[part])))
+            torques.append(torque)
         states += [0.2, w]
     matrix, target = np.array(rows), np.array(torques)
     change = np.abs(matrix[:, 0])
@@ -192,8 +192,20 @@ def test_mean_motions_are_a_weighted_regression_of_mean_torques(power: float) ->
     std = np.sqrt(np.diag(np.linalg.inv(weighted.T @ weighted)) * rest[0] / (len(target) - 3))
     found, covariance, begun = mechanics._mean_motion(runs, power)
     deviations = np.sqrt(np.diag(covariance))
-    assert found == pytest.approx(x, rel=1e-6) and deviations == pytest.approx(std, rel=1e-5)
+    assert found == pytest.approx(x, rel=1e-4) and deviations == pytest.approx(std, rel=1e-3)
     assert begun == pytest.approx(states, rel=1e-6, abs=1e-9)
+
+
+def test_a_torque_that_falls_within_a_half_counts_as_a_parabola_weighs_it() -> None:
+    """What was left of a current in the first tenth of a coasting made B ten times too large, at +-13 %."""
+    J, B, tau_c, T = 2e-3, 1e-3, 0.05, 0.005
+    t, runs = T * np.arange(201), []
+    for sign, left, held in ((1.0, 0.6, 0.5), (1.0, 0.4, 0.0), (-1.0, 0.6, 0.5), (-1.0, 0.4, 0.0)):
+        torque = sign * (held + left * np.exp(-t[:-1] / 0.05))
+        x = np.array([math.log(J), B, tau_c, 0.0, sign * 40.0])
+        runs.append(_run(positions(torque, T, x), torque, T))
+    found, *_ = mechanics._mean_motion(runs)
+    assert found == pytest.approx([J, B, tau_c], rel=1e-4)  # measured 6e-6; by mean torques 11, 32 and 62 % off
 
 
 def test_more_noise_is_what_the_residual_of_each_push_and_of_all_coasting_asks_for() -> None:

@@ -29,6 +29,7 @@ from pmsmtool.estimators.estimate import (
     SensorTolerance,
     chi2_gate,
     condition_gate,
+    coverage_factor,
     information_bound,
     information_weights,
 )
@@ -278,7 +279,8 @@ def mean_mechanics(
     step = encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, 0.0, direction, 1, step, NO_HARMONICS, 0.0)[1] for run in runs]
     values, covariance, _ = _mean_motion(blocks, power=1.0)
-    stds = np.sqrt(np.diag(covariance)).tolist()
+    student = coverage_factor(2 * len(runs) - len(values)) / COVERAGE_FACTOR
+    stds = (student * np.sqrt(np.diag(covariance))).tolist()
     if not values[0] > 0.0:
         return {}
     if values[1] < 0.0:
@@ -402,12 +404,14 @@ def _mean_motion(runs: Sequence[Run], power: float = 0.0) -> tuple[Array, NDArra
         way = np.abs(np.diff(run.theta))
         moving = max(MOVING_LEAST, int(np.nonzero(way > LEAST_SPEED * np.max(way))[0][-1]) + 1)  # a rest tells nothing
         t = run.T * np.arange(moving)
-        # a parabola follows a push or a coasting closely enough for a start; halves of it tell the friction's slope
+        # what makes a parabola's curvature of the position makes it of the speed's and the torque's integrals, too
+        gain = run.T * np.append(0.0, np.cumsum(run.torque))
+        once, twice = (run.T * np.append(0.0, np.cumsum(0.5 * (x[1:] + x[:-1]))) for x in (run.theta, gain))
+        ways = np.stack([run.theta, once, twice], axis=1)
         for part in (slice(0, moving // 2), slice(moving // 2, moving)):
-            a, b, _ = np.polyfit(t[part], run.theta[part], 2)
-            omega = b + 2.0 * a * float(np.mean(t[part]))
-            rows.append([2.0 * a, omega, math.copysign(1.0, omega)])
-            torques.append(float(np.mean(run.torque[part])))
+            a, omega, mean = 2.0 * np.polyfit(t[part], ways[part], 2)[0]
+            rows.append([a, omega, math.copysign(1.0, omega)])
+            torques.append(float(mean))
         first = np.polyfit(t[: len(t) // 4], run.theta[: len(t) // 4], 2)
         states += [run.theta[0], float(first[1])]
     change = np.abs(np.array(rows)[:, 0])
