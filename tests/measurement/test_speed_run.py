@@ -176,6 +176,31 @@ def test_what_keeps_the_speed_is_looked_at_once_of_a_shaft_that_coasts() -> None
     assert holds == [8, 1]
 
 
+class LightShaft(Shaft):
+    """It slows down within a window, and its angle is old: a d current makes torque in proportion to the speed."""
+
+    PER_AMPERE, FRICTION_A, OLD_S = 1500.0, 1.0, 5e-5
+
+    def wait(self, seconds: float) -> None:
+        against_a = math.copysign(self.FRICTION_A, self.omega)
+        if self.controlled:
+            self.omega, self.i_a = self.asked_rad_s, (0.0, math.copysign(self.FRICTION_A, self.asked_rad_s))
+        else:
+            i_d, i_q = self.i_a
+            self.omega += self.PER_AMPERE * (i_q - self.OLD_S * self.omega * i_d - against_a) * seconds
+
+
+def test_what_a_d_current_of_an_old_angle_turns_is_taken_out() -> None:
+    """A light shaft ran 28 % too fast, past the limit, and identification ended there."""
+    plan = SpeedPlan(600.0, 30.0, 0.0, per_ampere_rad_s2=0.8 * LightShaft.PER_AMPERE)
+    rows = coast_through(LightShaft(1.0, 0.5), plan, 1)  # type: ignore[arg-type]
+    assert [row["i_d_a"] for row in rows[-6:]] == [-10.0, 10.0, 20.0, -20.0, -30.0, 30.0]
+    fast = [abs(row["omega_second_rad_s"]) for row in rows]
+    changes = [abs(row["omega_second_rad_s"] / row["omega_first_rad_s"] - 1.0) for row in rows]
+    assert max(fast) < 615.0  # measured 609; 765 with what the angle makes
+    assert max(changes[14:20] + changes[-6:]) < 0.01 < min(changes[:2])  # 0.004 beside 0.07
+
+
 def ripple_of(drive: MachineFile) -> float:
     """Largest amplitude of the current's ripple (A)."""
     machine = drive.machine
