@@ -33,7 +33,7 @@ static uint64_t whole_doubles(uint64_t bytes)
 
 /* ---- one drive -------------------------------------------------------------------------------------------------- */
 
-static void look(const pmsm_sim *sim, uint64_t period, pmsm_drive_run *r)
+static void look(const pmsm_sim *sim, pmsm_drive_run *r)
 {
     const pmsm_plant_state *state = &sim->plant.state;
     const uint32_t flags = sim->drive->application.control.live.flags;
@@ -46,35 +46,23 @@ static void look(const pmsm_sim *sim, uint64_t period, pmsm_drive_run *r)
         r->u_peak = voltage;
     if (fabs(state->omega_M) > r->omega_peak)
         r->omega_peak = fabs(state->omega_M);
-    if (sim->plant.T_winding > r->T_winding_peak)
-        r->T_winding_peak = sim->plant.T_winding;
     r->i_square += square;
     r->torque += fabs(state->torque);
-    r->limited += (flags & PMSM_FLAG_VOLTAGE_LIMITED) != 0u;
-    r->governed += (flags & PMSM_FLAG_GOVERNOR_ACTIVE) != 0u;
     r->infeasible += (flags & (PMSM_FLAG_GOVERNOR_FALLBACK | PMSM_FLAG_FW_EMPTY)) != 0u;
-    if (sim->drive->application.trip && r->trip_period > period)
-        r->trip_period = period;
 }
 
 static void run_drive(const worker *by, uint32_t k)
 {
     const pmsm_monte_carlo *all = by->all;
-    const uint64_t numbers = all->record_rows * all->record_signals;
     pmsm_drive_run r;
     memset(&r, 0, sizeof r);
-    r.T_winding_peak = all->setup[k].T_winding;
-    r.trip_period = all->periods;
     memcpy(by->drive, all->model->drive, sizeof *by->drive);
     pmsm_sim_start(by->sim, by->drive, &all->setup[k]);
     memcpy(by->sim->schedule, all->model->schedule, sizeof by->sim->schedule);
     by->sim->scheduled = all->model->scheduled;
-    if (all->record)
-        pmsm_sim_set_record(by->sim, all->record + k * numbers, all->record_rows, all->record_signals,
-                            all->record_signal, all->record_decimation);
     for (uint64_t period = 0; period < all->periods; period++) {
         (void)pmsm_sim_run(by->sim, 1u);
-        look(by->sim, period, &r);
+        look(by->sim, &r);
     }
     r.i_peak = sqrt(r.i_peak);
     r.u_peak = sqrt(r.u_peak);

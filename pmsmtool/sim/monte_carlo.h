@@ -20,11 +20,7 @@ typedef struct {               /* what is kept of one drive; of the machine, not
     double torque;             /* N m, mean of its amount */
     double omega_peak;         /* rad/s mechanical, largest amount */
     double u_peak;             /* largest voltage demanded, behind the limiter, over the DC link of its period */
-    double T_winding_peak;     /* degC */
-    uint64_t limited;          /* periods in which the demanded voltage left the linear range */
-    uint64_t governed;         /* periods in which the governor changed the reference */
     uint64_t infeasible;       /* periods in which governor or field weakening found no admissible current */
-    uint64_t trip_period;      /* first period with a trip; periods when there was none */
     uint64_t outside;          /* flux-map evaluations outside the map */
     uint32_t trip;             /* enum pmsm_trip at the end */
     uint32_t reserved;         /* 0; fills the struct on every platform */
@@ -37,10 +33,6 @@ typedef struct {
     uint32_t threads;          /* 1..PMSM_MONTE_CARLO_THREADS_MAX; cut to n */
     uint64_t periods;
     void *memory;              /* threads * pmsm_monte_carlo_memory() bytes, aligned as a double */
-    double *record;            /* null, or n * rows * signals numbers as pmsm_sim_set_record() writes them */
-    uint64_t record_rows;
-    uint32_t record_signals, record_decimation;
-    const uint32_t *record_signal;
     pmsm_drive_run *result;    /* n */
 } pmsm_monte_carlo;
 

@@ -8,7 +8,6 @@ depend neither on the number of threads nor on the other drives.
 from __future__ import annotations
 
 import ctypes
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -76,12 +75,8 @@ class DriveRuns:
         Share of the periods with no admissible current at all.
     trip : ndarray of int
         Latched trip as CiA 402 error code, 0 without.
-    trip_s : ndarray
-        When it came (s); NaN without.
     outside : ndarray of int
         Evaluations outside the flux map.
-    record : ndarray, shape (n, rows, signals)
-        What was asked to be recorded; no rows otherwise.
     """
 
     i_peak_a: Array
@@ -91,9 +86,7 @@ class DriveRuns:
     u_peak: Array
     infeasible: Array
     trip: NDArray[np.int64]
-    trip_s: Array
     outside: NDArray[np.int64]
-    record: Array
 
 
 _Task, _RESULT = STRUCTS["pmsm_monte_carlo"], np.dtype(STRUCTS["pmsm_drive_run"])
@@ -124,7 +117,6 @@ def simulate_many(
     variations: Sequence[Variation],
     *,
     threads: int | None = None,
-    signals: Sequence[int] = (),
 ) -> DriveRuns:
     """Run a scenario on many drives, in one call of the kernel. Raises ConfigError: what cannot be simulated together.
 
@@ -136,8 +128,6 @@ def simulate_many(
         One per drive.
     threads : int, optional
         Threads; one per core when not given. The result does not depend on it.
-    signals : sequence of int
-        Signals (``signals.Signal``, ``signals.Truth``) recorded of every drive, every ``scenario.decimation`` periods.
     """
     lib = _library()
     machine_file, model, periods = open_simulation(machine_file, params, scenario, None)
@@ -148,22 +138,10 @@ def simulate_many(
     keep = [vary(setups[k], model.setup, scalable, variation) for k, variation in enumerate(variations)]
     workers = min(max(1, cores() if threads is None else threads), max(1, n), THREADS_MAX)
     memory = np.zeros(workers * lib.pmsm_monte_carlo_memory() // 8)
-    names = np.ascontiguousarray(signals, dtype=np.uint32)
-    rows = -(-periods // scenario.decimation) if names.size else 0
-    record = np.zeros((n, rows, names.size))
-    result = np.zeros(n, dtype=_RESULT)
-    task = _Task(
-        model.sim, ctypes.addressof(setups), n, workers, periods, memory.ctypes.data,
-        record.ctypes.data if names.size else None, rows, names.size, scenario.decimation, names.ctypes.data,
-        result.ctypes.data,
-    )  # fmt: skip
+    result: NDArray[Any] = np.zeros(n, dtype=_RESULT)
+    task = _Task(model.sim, ctypes.addressof(setups), n, workers, periods, memory.ctypes.data, result.ctypes.data)
     lib.pmsm_monte_carlo_run(ctypes.byref(task))
     del keep  # the flux maps of the machines had to live until here
-    return _runs(result, periods, 1e-9 * model.params.inverter_T_s_ns, record)
-
-
-def _runs(result: NDArray[Any], periods: int, T_s: float, record: Array) -> DriveRuns:
-    tripped = result["trip_period"] < periods
     return DriveRuns(
         i_peak_a=result["i_peak"].copy(),
         i_rms_a=np.sqrt(result["i_square"]),
@@ -172,9 +150,7 @@ def _runs(result: NDArray[Any], periods: int, T_s: float, record: Array) -> Driv
         u_peak=result["u_peak"].copy(),
         infeasible=result["infeasible"] / periods,
         trip=result["trip"].astype(np.int64),
-        trip_s=np.where(tripped, T_s * result["trip_period"].astype(np.float64), math.nan),
         outside=result["outside"].astype(np.int64),
-        record=record,
     )
 
 
