@@ -9,6 +9,7 @@ import contextlib
 import gc
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -27,6 +28,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 from tests import wall_clock
+
+# And every worker compiles all tests, for 8 s.
+sys.dont_write_bytecode = False
 
 # What a disk holds after a power cut no test sees; a sync takes 4 ms, and 3 ms more when its file is removed.
 # ``tests/test_files.py`` asks for the syncs themselves.
