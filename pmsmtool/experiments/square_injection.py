@@ -86,10 +86,11 @@ def find_amplitude(drive: Drive, plan: SquarePlan, axis: Axis, first_v: float | 
 
     ``first_v`` is the amplitude of the first one; None: small enough for any machine.
     """
-    quick = replace(plan, lead_s=min(SEARCH_LEAD_S, SEARCH_LEAD_SHARE * plan.lead_s))
+    lead_s = min(SEARCH_LEAD_S, SEARCH_LEAD_SHARE * plan.lead_s)
+    quick = replace(plan, lead_s=lead_s, samples=SEARCH_SAMPLES)
     amplitude = min(FIRST_SHARE * plan.u_max_v if first_v is None else first_v, plan.u_max_v)
     for _ in range(SEARCH_STEPS):
-        trace = inject_square(drive, quick, axis, plan.half_periods[0], amplitude, SEARCH_SAMPLES, (f"i_{axis}_a",))
+        trace = inject_square(drive, quick, axis, plan.half_periods[0], amplitude, (f"i_{axis}_a",))
         ripple = ripple_of(trace, axis)
         wanted = min(plan.u_max_v, amplitude * plan.ripple_a / max(ripple, 1e-9))
         if ripple >= ENOUGH * plan.ripple_a or amplitude >= plan.u_max_v:
@@ -123,16 +124,14 @@ def inject_square(
     axis: Axis,
     half_period: int,
     amplitude_v: float,
-    samples: int | None = None,
     signals: Sequence[str] | None = None,
 ) -> Trace:
     """Record one shot, by default of all that an estimate needs; the bias stays on before and after it.
 
     Raises DriveFault: the drive aborted the excitation at one of its limits.
     """
-    count = plan.samples if samples is None else samples
     # the lead and the bus time between starting the injection and arming the recorder
-    running_s = plan.lead_s + BUS_ALLOWANCE_S + count * drive.period_s
+    running_s = plan.lead_s + BUS_ALLOWANCE_S + plan.samples * drive.period_s
     excitation = Excitation(
         shape=Shape.SQUARE,
         point=Injection.U_D if axis == "d" else Injection.U_Q,
@@ -149,4 +148,4 @@ def inject_square(
     if signals is None:
         signals = ("i_d_a", "i_q_a", f"u_{axis}_v", "theta_m_rad", "flags")
         facts["T_winding_c"] = drive.live("T_winding_c")
-    return readable(drive.record(signals, count, excitation=excitation), **facts)
+    return readable(drive.record(signals, plan.samples, excitation=excitation), **facts)

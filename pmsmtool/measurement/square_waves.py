@@ -156,29 +156,16 @@ class SquareStage:
             for half_period in plan.half_periods:
                 if self.quick and slow:
                     break  # two half periods are enough, and the slow one shows more
-                L = self._shot(encoder, plan, axis, half_period, amplitude)
+                shot = self._shot(f"square_{axis}_{half_period}", encoder, plan, axis, half_period, amplitude)
+                L = amplitude * half_period * self.drive.period_s / square_injection.ripple_of(shot, axis)
                 slow = square_injection.slow_half_period(plan, self.drive.period_s, L / resistance.R_measured.value)
             if slow:
-                self._shot(encoder, plan, axis, slow, amplitude * last / slow)
+                self._shot(f"square_{axis}_{slow}", encoder, plan, axis, slow, amplitude * last / slow)
             rough.append(L)
             amplitudes[axis] = amplitude
         plan = self._further_angles(plan, encoder, knee, amplitudes)
         self.drive.command_current(0.0, 0.0, fixed_angle_rad=plan.angle_rad)
         return rough[0], rough[1]
-
-    def _shot(
-        self,
-        encoder: EncoderResult,
-        plan: square_injection.SquarePlan,
-        axis: square_injection.Axis,
-        half_period: int,
-        amplitude_v: float,
-    ) -> float:
-        """Record a shot of all samples; return the inductance (H) by its ripple."""
-        samples = max(plan.samples, whole_periods(half_period))  # few samples are enough, few periods are not
-        shot = self._still(encoder, plan, axis, half_period, amplitude_v, samples)
-        self.keep(f"square_{axis}_{half_period}", shot)
-        return amplitude_v * half_period * self.drive.period_s / square_injection.ripple_of(shot, axis)
 
     def _further_angles(
         self,
@@ -191,7 +178,7 @@ class SquareStage:
         if self.held:
             return plan
         self.say("L_d, L_q over the angle: square waves at more angles of the rotor")
-        at = replace(plan, lead_s=FURTHER_LEAD_S)
+        at = replace(plan, lead_s=FURTHER_LEAD_S, samples=self.samples // 4)
         target, angles = FURTHER_RAD, [self._rotor(encoder, plan.angle_rad)]
         for k, near in enumerate(FURTHER_NEAR_RAD):
             at = self._rotor_to(target, near, at, encoder, elsewhere=not k)
@@ -201,31 +188,31 @@ class SquareStage:
                 break
             ripple = clear_ripple(plan.ripple_a, plan.bias_d_a, knee_a, beside)
             for axis, amplitude in amplitudes.items():
-                half_period = plan.half_periods[0]
-                samples = max(self.samples // 4, whole_periods(half_period))
-                shot = self._still(encoder, at, axis, half_period, ripple / plan.ripple_a * amplitude, samples)
-                self.keep(f"angle_{axis}_{k}", shot)
+                amplitude *= ripple / plan.ripple_a
+                self._shot(f"angle_{axis}_{k}", encoder, at, axis, plan.half_periods[0], amplitude)
             angles.append(at.angle_rad)
             if k and unseen_std(angles) < UNSEEN_STD:
                 break
             target = at.angle_rad + 0.5 * math.pi
         return at
 
-    def _still(
+    def _shot(
         self,
+        name: str,
         encoder: EncoderResult,
         plan: square_injection.SquarePlan,
         axis: square_injection.Axis,
         half_period: int,
         amplitude_v: float,
-        samples: int | None = None,
     ) -> Trace:
-        """Record a shot, and with a longer lead where the rotor still came back from the first half wave in it."""
+        """Store a shot, recorded with a longer lead where the rotor still came back from the first half wave in it."""
+        samples = max(plan.samples, whole_periods(half_period))  # few samples are enough, few periods are not
         for lead in LEADS:
-            at = replace(plan, lead_s=lead * plan.lead_s)
-            shot = square_injection.inject_square(self.drive, at, axis, half_period, amplitude_v, samples)
+            at = replace(plan, lead_s=lead * plan.lead_s, samples=samples)
+            shot = square_injection.inject_square(self.drive, at, axis, half_period, amplitude_v)
             if rotor_way(encoder.pole_pairs.value * shot["theta_M_rad"]) <= ROTOR_LIMIT_RAD:
                 break
+        self.keep(name, shot)
         return shot
 
     def _rotor_to(

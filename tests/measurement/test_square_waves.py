@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import square_injection
 from pmsmtool.machine.parameters import Estimate
-from pmsmtool.measurement.square_waves import LEADS, SquareStage, knee_of
+from pmsmtool.measurement.square_waves import LEADS, SquareStage, knee_of, whole_periods
 from pmsmtool.trace import Trace
 
 PAIRS = 4
@@ -38,8 +39,11 @@ def test_a_shot_is_recorded_until_the_rotor_stands_still(
         return Trace(np.arange(400) / 8e3, {"theta_M_rad": np.linspace(0.0, way, 400)}, {"theta_M_rad": "rad"})
 
     monkeypatch.setattr(square_injection, "inject_square", inject)
-    stage = SquareStage(*[None] * 4, ripple_share=0.25)  # type: ignore[arg-type]
-    shot = stage._still(ENCODER, PLAN, "q", 9, 50.0)
+    kept: dict[str, Trace] = {}
+    stage = SquareStage(None, None, kept.__setitem__, print, ripple_share=0.25)  # type: ignore[arg-type]
+    shot = stage._shot("square_q_9", ENCODER, replace(PLAN, samples=100), "q", 9, 50.0)
+    assert kept == {"square_q_9": shot}
+    assert {plan.samples for plan in plans} == {whole_periods(9)}, "few samples are enough, few periods are not"
     assert [plan.lead_s for plan in plans] == pytest.approx([lead * PLAN.lead_s for lead in LEADS[:recorded]])
     assert math.degrees(float(shot["theta_M_rad"][-1])) * PAIRS == pytest.approx(ways_deg[recorded - 1])
 
