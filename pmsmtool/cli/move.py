@@ -81,7 +81,7 @@ def move_command(
     mode. They rest on the flux linkage and the pole pairs of MACHINE. Exit code 6 when the moves do not identify them.
     """
     from pmsmtool.axis.move import UNITS, move_result, shown
-    from pmsmtool.cli.consent import ask_motion
+    from pmsmtool.cli.consent import ask_motion, keep
     from pmsmtool.commissioning.designed_move import foretold_move, limits_of_move
     from pmsmtool.design.design_file import load_design
     from pmsmtool.drive.envelope import Envelope, largest_acceleration
@@ -140,8 +140,9 @@ def move_command(
             *(f"changed for the move: {name} {value:.5g} {_unit(name)}" for name, value in lent.items()),
             "nothing is stored in the drive; every changed object is restored",
         ]  # fmt: skip
-        ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
+        consent = ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
         run = new_run(bus, drive, runs)
+        keep(run, consent)
         with guarded(drive, envelope, say=out.note) as guard:
             guard.write(lent)
             began = connection.clock.now()

@@ -16,6 +16,7 @@ from pmsmtool.arrays import Array
 from pmsmtool.axis.design import PID
 from pmsmtool.axis.move import mirrored, trapezoid_of
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
+from pmsmtool.run_directory import RunDirectory
 from pmsmtool.trace import Trace, read_trace
 from pmsmtool.units import rad_s_from_rpm
 from tests.cli.conftest import Tool
@@ -52,6 +53,7 @@ def test_the_same_move_with_stored_and_with_new_gains(tool: Tool, drive: Sequenc
     assert code == 0, said
     assert "every changed object is restored" in said and "voltage off, drive restored" in said
     before = json.loads(printed)
+    assert [given["subject"] for given in RunDirectory(Path(before["run"])).read().consents] == ["motion"]
     assert tool("tune", "interior-2k2", "-o", "axis.toml", "--axis", "--map", "epos4")[0] == 0
     code, _, said = tool("flash-params", "axis.toml", "--map", "epos4", *drive, "--yes")
     assert code == 0, said
