@@ -16,8 +16,9 @@ With ``--drive FAMILY`` a simulated drive of that family does the whole job over
 gives: `backup`, `tune --axis --stored`, `move`, `flash-params`, `move`. Stored are the gains of its face (crossover 60
 rad/s and 15 1/s for the whole inertia, no feed-forward). The move is of 60 degrees at half of the designed
 acceleration, at most 300 rad/s2; after `map learn` as the design gives it within the drive's own limits of current.
-Said besides are how long both moves kept the drive, their following errors over the predicted ones, and why a load got
-no comparison.
+Said besides are how long both moves kept the drive, how often a person is asked for consent, the following errors
+over the predicted ones, and why a load got no comparison. The ratio is infinite where the designed gains cannot do the
+move.
 
 Families whose gains have no published unit are nodes of a ``--table`` (``sim/foreign/file_rows.py``) with gains that a
 seed drew for the motor alone (``sim/foreign/drawn_gains.py``). There `map learn` comes first, on the uncoupled motor;
@@ -38,6 +39,7 @@ import numpy as np
 
 from benchmarks.makers_drives import asked
 from pmsmtool.axis.design import AxisRequest
+from pmsmtool.cli import consent
 from pmsmtool.commissioning.axis_design import design_axis
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.tune_request import TuneRequest
@@ -128,6 +130,21 @@ SHARE_OF_ACCELERATION, FASTEST = 0.5, 300.0
 """Acceleration of the compared move: of the designed one, and its largest (rad/s2)."""
 
 
+PROMPTS = {"motion": 0, "writing": 0}
+"""How often consent was asked for since :func:`count_prompts`; ``--yes`` answers."""
+
+
+def count_prompts() -> None:
+    """Count what the commands ask a person for."""
+    for subject, question in (("motion", consent.ask_motion), ("writing", consent.ask_writing)):
+
+        def counted(*given: Any, subject: str = subject, question: Any = question, **options: Any) -> Any:
+            PROMPTS[subject] += 1
+            return question(*given, **options)
+
+        setattr(consent, question.__name__, counted)
+
+
 def done(*arguments: str) -> Any:
     """Run a command and return what it answers.
 
@@ -154,8 +171,8 @@ def learned(family: str, channel: str) -> None:
         raise RuntimeError(f"map learn: no object is known for one of {', '.join(GAINS)}")
 
 
-def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float, float, str]:
-    """Return the ratio of following errors on a family's drive, margins (degree, dB), seconds of the moves, and a line.
+def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float, float, int, str]:
+    """Return the ratio of errors on a family's drive, margins (degree, dB), seconds of the moves, prompts, and a line.
 
     Raises
     ------
@@ -163,6 +180,7 @@ def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float
         A command ended with an error, or a gain stayed unknown.
     """
     truth, known = loaded(seed)
+    PROMPTS.update(motion=0, writing=0)
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         os.environ["PMSMTOOL_HOME"] = folder
@@ -187,21 +205,25 @@ def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float
         if code != 0 and not reason.startswith(UNABLE):
             raise RuntimeError(f"move with the stored gains: exit {code}: {reason}")
         done("flash-params", "axis.toml", *drive, "--yes")
-        after = done(*move)
+        code, after, why = asked(*move, "--json")
+        if code != 0 and not why.startswith(UNABLE):
+            raise RuntimeError(f"move with the designed gains: exit {code}: {why}")
         runs = [RunDirectory(Path(one["run"])).read().stage("move") for one in (before, after) if "run" in one]
     errors = [math.degrees(one["move"]["error_peak_rad"]) if one else math.inf for one in (before, after)]
     phase = min(float(made["facts"][f"axis_{loop}_phase_least_deg"]) for loop in ("speed", "position"))
     peak = max(float(made["facts"][f"axis_{loop}_S_peak_db"]) for loop in ("speed", "position"))
     seconds = sum(run.seconds for run in runs if run is not None)
-    ratio = errors[1] / errors[0]
+    if all(math.isinf(error) for error in errors):
+        raise RuntimeError(f"neither the stored nor the designed gains can do the move: {reason}; {why}")
+    ratio, prompts = errors[1] / errors[0], sum(PROMPTS.values())
     stored = f"{errors[0]:.3g} deg" if math.isfinite(errors[0]) else f"cannot do it ({reason})"
-    told = "; ".join(foretold(one) for one in (before, after) if one)
+    told = "; ".join(foretold(one) for one in (before, after) if one) + ("" if after else f"; designed: {why}")
     line = (
         f"{known.machine.resonance_hz:.0f} Hz, load {float(made['facts']['axis_load_ratio']):.2g}: stored "
-        f"{stored}, with --stored x {ratio:.2f} ({phase:.0f} deg, {peak:.1f} dB, {seconds:.0f} s; {told}; stored "
-        f"gains {made['facts']['axis_stored_gains']})"
+        f"{stored}, with --stored x {ratio:.2f} ({phase:.0f} deg, {peak:.1f} dB, {seconds:.0f} s, {prompts} prompts; "
+        f"{told}; stored gains {made['facts']['axis_stored_gains']})"
     )
-    return ratio, phase, peak, seconds, line
+    return ratio, phase, peak, seconds, prompts, line
 
 
 def foretold(answer: Any) -> str:
@@ -215,6 +237,7 @@ def compare_on(family: str, first: int, loads: int, table: str) -> None:
     """Compare moves of random loads on a family's drive; print a line for every one, and the shares."""
     rows, ended = [], 0
     before = Path.cwd()
+    count_prompts()
     for seed in range(first, first + loads):
         try:
             *numbers, line = compared_on(family, seed, table)
@@ -228,11 +251,11 @@ def compare_on(family: str, first: int, loads: int, table: str) -> None:
     if not rows:
         print(f"none of {loads} compared")
         return
-    ratios, phases, peaks, seconds = np.array(rows).T
+    ratios, phases, peaks, seconds, prompts = np.array(rows).T
     print(f"following error over that of the stored gains: median {np.median(ratios):.2f}, p95 "
           f"{np.quantile(ratios, 0.95):.2f}, largest {ratios.max():.2f}; least margin {phases.min():.1f} deg, "
-          f"largest |S| {peaks.max():.1f} dB; both moves at most {seconds.max():.0f} s; {len(rows)} of {loads} "
-          f"compared, {ended} ended before")  # fmt: skip
+          f"largest |S| {peaks.max():.1f} dB; both moves at most {seconds.max():.0f} s, {prompts.max():.0f} prompts; "
+          f"{len(rows)} of {loads} compared, {ended} ended before")  # fmt: skip
 
 
 def main() -> None:

@@ -356,7 +356,7 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
         speed = stiffest(box, limits, notch=notch, loops=("speed",))
         position = stiffest(box, limits, notch=notch, loops=("position",))
     else:
-        speed = position = stiffest(box, limits, notch=notch, fed=drive.feeds(CASCADE[1]))
+        speed = position = stiffest(box, limits, notch=notch)
     torque = ratings_of(design).tau_max_nm
     if drive.torque_nm is not None and drive.torque_nm < torque:
         share, torque = drive.torque_nm / torque, drive.torque_nm

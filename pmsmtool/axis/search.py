@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: MIT
 """Gains of an axis: the stiffest control whose margins hold over the whole tolerance box.
 
-Maximised is K_i K_v, the integral gain from position error to torque: its inverse is the integral of the position error
-after a step of load torque. Where nothing feeds the speed forward a move stays v / K_v behind, too, and K_i K_v^2 is
-maximised. Constraints are least phase margin and largest |S|, of the speed loop alone and of both
-loops together. Source of the principle: K. J. Astrom, H. Panagopoulos, T. Hagglund, Automatica 34 (1998) 585.
+Maximised is K_i K_v^3, of a speed loop without position loop K_i times its crossover. The inverse of K_i K_v is the
+integral of the position error after a step of load torque (K. J. Astrom, H. Panagopoulos, T. Hagglund, Automatica 34
+(1998) 585). The error of a move goes with 1 / K_v: v / K_v where nothing feeds the speed forward, else a t / K_v, where
+the loop sees the speed t late. So K_v counts thrice: half of the stiffness is given for 1.4 times K_v. Constraints are
+least phase margin and largest |S|, of the speed loop alone and of both loops together.
 
 A loop is looked at on a grid of frequencies that has points inside every resonance: those of the path and those of the
 closed loop, whose poles are known. So no narrow peak lies between two points. Extrema are looked at again between their
@@ -31,7 +32,7 @@ from pmsmtool.machine.two_masses import Mechanics
 LOOPS: tuple[Loop, ...] = ("speed", "position")
 
 INTEGRAL_RATIOS = (3.0, 4.0, 6.0, 9.0, 14.0)
-POSITION_RATIOS = (3.0, 4.0, 6.0, 9.0, 14.0)
+POSITION_RATIOS = (1.25, 1.5, 2.0, 3.0, 4.0)
 """Ratios tried: crossover K_p / J over K_i / K_p, and over K_v."""
 NOTCH_WIDTHS = (0.25, 0.5, 1.0)
 """Denominator dampings of the notch tried."""
@@ -196,9 +197,7 @@ def _notches(path: AxisPath, allowed: bool) -> Iterator[Notch]:
             yield Notch(path.shaft.resonance_hz, NOTCH_DEPTH * width, width)
 
 
-def stiffest(
-    box: Box, limits: Limits, *, notch: bool = True, loops: Sequence[Loop] = LOOPS, fed: bool = True
-) -> AxisGains:
+def stiffest(box: Box, limits: Limits, *, notch: bool = True, loops: Sequence[Loop] = LOOPS) -> AxisGains:
     """Return the stiffest gains that keep the limits over the box. Raises DesignInfeasible: none does.
 
     Parameters
@@ -207,12 +206,9 @@ def stiffest(
         Whether the drive has a notch to set.
     loops : sequence of str
         Those that these gains decide; of ``speed`` alone K_v is not looked at.
-    fed : bool
-        Whether the speed of the reference is fed forward.
     """
     path = box.path
-    positions = POSITION_RATIOS if "position" in loops else POSITION_RATIOS[:1]
-    power = 1 if fed else 2
+    positions, power = (POSITION_RATIOS, 3) if "position" in loops else (POSITION_RATIOS[:1], 1)
     best: AxisGains | None = None
     for shape in sorted(
         itertools.product(INTEGRAL_RATIOS, positions, _notches(path, notch)), key=lambda one: one[0] * one[1] ** power
@@ -251,6 +247,7 @@ def _fastest(box: Box, limits: Limits, shape: Shape, floor: float, loops: Sequen
     path = box.path
     top = 1.0 / path.lag_s
     tried = [omega for omega in np.geomspace(1.0, SLOWEST, STEPS) * top if omega > floor]
+    tried += [floor] if floor else []  # the fastest may lie between it and the last of these
     for k, omega in enumerate(tried):
         if not box.may_hold(_gains(path, shape, float(omega)), limits, loops):
             continue

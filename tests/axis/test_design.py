@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from benchmarks.axis_loads import loaded
+from pmsmtool.axis import search
 from pmsmtool.axis.design import (
     CASCADE,
     LOOSEST,
@@ -29,7 +30,7 @@ from pmsmtool.axis.design import (
     profile_within,
     with_axis,
 )
-from pmsmtool.axis.loops import lifted
+from pmsmtool.axis.loops import best_share, following_error, lifted
 from pmsmtool.axis.move import Profile, plan
 from pmsmtool.axis.search import LOOPS, Box, Limits, _fastest, axis_margins, stiffest
 from pmsmtool.commissioning.axis_design import (
@@ -126,19 +127,36 @@ def test_a_shaft_with_play_is_no_rigid_one() -> None:
     assert any("swinging at 225 Hz" in case for case in swings), swings
 
 
-def test_a_drive_that_feeds_no_speed_forward_follows_closer() -> None:
-    """What stays v / K_v behind needs K_v more than stiffness; measured 2.3 times K_v with the same stiffness."""
+def test_the_gains_found_are_the_best_of_all_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shape whose fastest gains lie between the best so far and the next of the grid was left out: 30 % here."""
     made = designed("epos4", 0.0, 0.0)
     drive = AxisDrive("drive", frozenset((*SPEED, CASCADE[0])), own_core=False)
     path, _ = axis_path(made, ASKED, drive, mechanics_of(made.machine))
     box = Box(path, cases(made.machine, drive))
-    fed, behind = (stiffest(box, Limits(), fed=fed) for fed in (True, False))
-    assert behind.K_v > MORE_K_V * fed.K_v
-    assert behind.K_i * behind.K_v > 0.5 * fed.K_i * fed.K_v
-    assert box.holds(behind, Limits())
+    monkeypatch.setattr(search, "INTEGRAL_RATIOS", (6.0, 9.0))
+    monkeypatch.setattr(search, "POSITION_RATIOS", (3.0,))
+    found = [_fastest(box, Limits(), (ratio, 3.0, Notch()), 0.0, LOOPS) for ratio in (6.0, 9.0)]
+    best = stiffest(box, Limits())
+    most = max(gains.K_i * gains.K_v**3 for gains in found if gains is not None)
+    assert best.K_i * best.K_v**3 == pytest.approx(most, rel=FINEST)
+    assert box.holds(best, Limits())
 
 
-MORE_K_V = 1.2
+FINEST = 0.01
+"""A crossover is found to 0.1 % (44 steps over four decades, halved eight times)."""
+
+
+def test_an_axis_follows_no_worse_than_the_gains_that_tune_gives_without_it() -> None:
+    """Measured 0.71 times their error; 0.97 times with the largest K_i K_v, and it was 1.25 times."""
+    source, drive = machine(), axis_drive(load_family("pmsmsim"))
+    heavy = replace(source, machine=replace(source.machine, J_kgm2=10.0 * (source.machine.J_kgm2 or 0.0)))
+    plain, move = tune(heavy, TuneRequest()), plan(math.pi, Profile(100.0, 2000.0, 1e5))
+    made = with_axis(plain, ASKED, drive)
+    held = AxisGains(*(plain[name] for name in (*SPEED, CASCADE[0])))
+    after, before = (
+        best_share(*following_error(made.box.plant, made.box.path, gains, move))[1] for gains in (made.position, held)
+    )
+    assert after < 0.8 * before
 
 
 @pytest.mark.parametrize(("K_i", "expected"), [(2.0, 2.0), (0.5, 1.0 / 0.65535)])
@@ -274,7 +292,7 @@ def test_gains_that_leave_the_shaft_where_it_is_are_refused() -> None:
     source = loaded(946)[1]
     shaft = replace(source.machine, resonance_zeta=0.006)
     source = replace(source, machine=shaft, std={k: std for k, std in source.std.items() if k != "resonance_zeta"})
-    with pytest.raises(DesignInfeasible, match="a move of half a turn stays 352 deg behind"):
+    with pytest.raises(DesignInfeasible, match="a move of half a turn stays 244 deg behind"):
         design_axis(source, TuneRequest(), AxisRequest(), load_family("ingenia"))
 
 
