@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.makers_drives import asked
-from pmsmtool.axis.design import AxisRequest
+from pmsmtool.axis.drive import AxisRequest
 from pmsmtool.cli import consent
 from pmsmtool.commissioning.axis_design import design_axis
 from pmsmtool.design.design_file import Design

@@ -193,7 +193,7 @@ def _axis(
     machine: str, drive_map: DriveMap, asked: dict[str, Any], axis: dict[str, Any],
     path: Path, params_path: Path, out: Output,
 ) -> None:  # fmt: skip
-    from pmsmtool.axis.design import AxisRequest
+    from pmsmtool.axis.drive import AxisRequest
     from pmsmtool.commissioning.axis_design import axis_parameters, design_axis, flashed_design, not_offered, stored_in
     from pmsmtool.design.design_file import design_text
     from pmsmtool.design.tune_request import TuneRequest

@@ -11,7 +11,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from pmsmtool.axis.design import (
+from pmsmtool.axis.design import with_axis
+from pmsmtool.axis.drive import (
     AXIS_ROWS,
     CASCADE,
     PID,
@@ -20,9 +21,8 @@ from pmsmtool.axis.design import (
     AxisDrive,
     AxisRequest,
     assumed_torque,
-    at_least_as_good,
-    with_axis,
 )
+from pmsmtool.axis.stored_gains import at_least_as_good
 from pmsmtool.design.closed_drive import RATED, STATED
 from pmsmtool.design.design_file import Design, DesignValue, Scalar, load_design
 from pmsmtool.design.loops.open_loops import (

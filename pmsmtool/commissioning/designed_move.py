@@ -7,7 +7,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from pmsmtool.axis.design import AxisRequest, axis_path, cases, held_loop, move_peaks, profile_within
+from pmsmtool.axis.design import move_peaks, profile_within
+from pmsmtool.axis.drive import AxisRequest, axis_path, cases, held_loop
 from pmsmtool.axis.loops import AxisGains
 from pmsmtool.axis.move import Profile, plan
 from pmsmtool.axis.search import Box

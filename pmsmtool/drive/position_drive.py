@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager
 import numpy as np
 
 from pmsmtool.arrays import Array
-from pmsmtool.axis.design import AXIS_GAINS, NOTCH
+from pmsmtool.axis.drive import AXIS_GAINS, NOTCH
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode

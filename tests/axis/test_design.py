@@ -13,26 +13,22 @@ import pytest
 
 from benchmarks.axis_loads import loaded
 from pmsmtool.axis import search
-from pmsmtool.axis.design import (
+from pmsmtool.axis.design import move_peaks, profile_of, profile_within, with_axis
+from pmsmtool.axis.drive import (
     CASCADE,
     LOOSEST,
     PID,
     SPEED,
     AxisDrive,
-    AxisGains,
     AxisRequest,
-    at_least_as_good,
     axis_path,
     cases,
     from_pid,
-    move_peaks,
-    profile_of,
-    profile_within,
-    with_axis,
 )
-from pmsmtool.axis.loops import best_share, following_error, lifted
+from pmsmtool.axis.loops import AxisGains, best_share, following_error, lifted
 from pmsmtool.axis.move import Profile, plan
 from pmsmtool.axis.search import LOOPS, Box, Limits, _fastest, axis_margins, stiffest
+from pmsmtool.axis.stored_gains import at_least_as_good
 from pmsmtool.commissioning.axis_design import (
     GROUPS,
     _slowed,

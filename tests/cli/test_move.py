@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pmsmtool.arrays import Array
-from pmsmtool.axis.design import PID
+from pmsmtool.axis.drive import PID
 from pmsmtool.axis.move import mirrored, trapezoid_of
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.run_directory import RunDirectory

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from pmsmtool.axis.design import PID, AxisRequest
+from pmsmtool.axis.drive import PID, AxisRequest
 from pmsmtool.axis.move import Profile
 from pmsmtool.commissioning.axis_design import design_axis
 from pmsmtool.commissioning.designed_move import DESIGNED, HELD, foretold_move, limits_of_move

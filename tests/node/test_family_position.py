@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from pmsmtool.axis.design import from_pid
+from pmsmtool.axis.drive import from_pid
 from pmsmtool.axis.loops import AxisGains
 from pmsmtool.bus.connect import connect
 from pmsmtool.drive.drive_node import DriveNode
