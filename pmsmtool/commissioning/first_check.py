@@ -121,8 +121,16 @@ def check_wiring(
     except DriveFault as error:  # the guard has stopped the machine
         found = with_fault(found, error)
     except LimitExceeded as error:
-        found.append(Finding("shaft", WRONG, error.what, error.likely or TURNED_BY))
+        found.append(led_beyond(error))
     return _ordered(found)
+
+
+def led_beyond(error: LimitExceeded) -> Finding:
+    """Return the row of a limit that ended a turn by a vector; its time is over where the rotor swings on."""
+    if not error.quantity.startswith("time"):
+        return Finding("shaft", WRONG, error.what, error.likely or TURNED_BY)
+    seen = f"the rotor had not come to rest on the vector when {error.limit:g} s were over"
+    return Finding("shaft", NOT_SEEN, seen, "an open phase, or so little friction that it swings on")
 
 
 def with_fault(rows: list[Finding], error: DriveFault) -> list[Finding]:
@@ -144,10 +152,16 @@ def fault_row(what: str, likely: str) -> Finding:
     return Finding("shaft", WRONG, what, likely or "a limit switch; " + TURNED_BY)
 
 
+def why_unseen(found: list[Finding]) -> str:
+    """Say why other things were not looked at, beside what was."""
+    wrong = any(finding.verdict == WRONG for finding in found)
+    return "mend what is wrong first" if wrong else "the check ended before it"
+
+
 def _ordered(found: list[Finding]) -> list[Finding]:
     """Return the rows in their order, with one for each thing that was not looked at."""
     missing = set(ALL) - {finding.looked_at for finding in found}
-    rows = [*found, *(Finding(name, NOT_SEEN, "mend what is wrong first") for name in missing)]
+    rows = [*found, *(Finding(name, NOT_SEEN, why_unseen(found)) for name in missing)]
     return sorted(rows, key=lambda row: ORDER.index(row.looked_at))
 
 

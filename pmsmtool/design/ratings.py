@@ -22,6 +22,7 @@ from pmsmtool.machine.parameters import MachineParameters, dead_time_compensatio
 from pmsmtool.machine.temperature import loop_coefficient_per_k
 from pmsmtool.machine.uncontrolled_generation import FaultReaction, Protection, fault_reaction
 from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.params.parameter_set import ASSUMED
 from pmsmtool.units import RPM_PER_RAD_S
 
 TRIP_CURRENT_RATIO = 1.5
@@ -199,7 +200,7 @@ def rating_values(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]
 def _motor(source: MachineFile, rated: Ratings) -> dict[str, DesignValue]:
     machine, how = source.machine, rated.methods
     app = "apparent" if machine.L_d_app_h is not None or machine.L_q_app_h is not None else "as incremental"
-    time, time_how = (machine.I_max_time_s, GIVEN) if machine.I_max_time_s is not None else (OVERLOAD_S, "assumed")
+    time, time_how = (machine.I_max_time_s, GIVEN) if machine.I_max_time_s is not None else (OVERLOAD_S, ASSUMED)
     given: dict[str, float] = {
         "pole_pairs": machine.pole_pairs,
         "R_s_ohm": machine.R_s_ohm,

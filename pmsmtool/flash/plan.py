@@ -14,7 +14,7 @@ from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive_maps.drive_map import DriveMap, address_in
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, INCREMENTS, MIDDLE_KIND, TORQUE_PER_AMPERE
-from pmsmtool.params.parameter_set import ParameterSet, table_unit
+from pmsmtool.params.parameter_set import ASSUMED, ParameterSet, table_unit
 
 QUANTISATION_SHOWN = 1e-6
 """Relative rounding from which the value the drive holds is shown beside the one asked for (binary32: 6e-8)."""
@@ -88,12 +88,15 @@ class Plan:
         Content hash of the set.
     reasons : mapping of str to str
         What the drive's map leaves out by name: these entries are told one by one.
+    kept : tuple of str
+        Entries whose object is there and stays as it is.
     """
 
     entries: tuple[Change, ...]
     not_written: Mapping[str, str] = field(default_factory=dict)
     content: str = ""
     reasons: Mapping[str, str] = field(default_factory=dict)
+    kept: tuple[str, ...] = ()
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -159,6 +162,8 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
     wanted, given = _with_own_torque(drive_map, wanted, found)
     wanted, own = _with_own_increments(drive_map, wanted, found)
     given |= own
+    kept = {} if drive_map.staging else _kept(drive_map, wanted)
+    wanted = replace(wanted, values={name: value for name, value in wanted.values.items() if name not in kept})
     encoded = drive_map.encode(wanted)
     held = drive_map.decode(encoded, given).values
     before = drive_map.decode({name: data for name, data in found.items() if name in drive_map.cells}, given).values
@@ -170,8 +175,18 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
         unit = BY_NAME[name].unit if scalar else table_unit(name)
         entries.append(Change(name, index, sub, found[name], new, *values, unit))
     lacking = drive_map.not_written([*wanted.values, *wanted.tables])
-    lacking = {name: why for name, why in lacking.items() if name not in given}
-    return Plan(tuple(entries), lacking, wanted.content_hash(), drive_map.left_out)
+    lacking = {name: why for name, why in lacking.items() if name not in given} | kept
+    return Plan(tuple(entries), lacking, wanted.content_hash(), {**drive_map.left_out, **kept}, tuple(kept))
+
+
+def _kept(drive_map: DriveMap, wanted: ParameterSet) -> dict[str, str]:
+    """Return what another maker's drive keeps: a value that nobody stated must not lift a limit of its set-up."""
+    names = [name for name in wanted.values if name in drive_map.cells and wanted.provenance.get(name) == ASSUMED]
+    return {
+        name: f"{wanted.values[name]:g} {BY_NAME[name].unit} is assumed, the machine file states no "
+        f"{name.partition('.')[2]}: the drive keeps its own"
+        for name in names
+    }
 
 
 def _with_own_torque(

@@ -63,9 +63,8 @@ def plan_download(node: DriveNode, wanted: ParameterSet) -> Plan:
 
 def tell_lacking(node: DriveNode, plan: Plan) -> None:
     """Raise Partial where values of a set have a row in the map and no object on this drive."""
-    lacking = [
-        f"{name}: {plan.reasons[name]}" for name in plan.missing if name in node.map.cells and name in plan.reasons
-    ]
+    rows = (name for name in plan.missing if name in node.map.cells and name not in plan.kept)
+    lacking = [f"{name}: {plan.reasons[name]}" for name in rows if name in plan.reasons]
     if lacking:
         raise Partial(
             f"{counted(len(lacking), 'value')} with a row in the map {node.map.name!r} left out on this drive",

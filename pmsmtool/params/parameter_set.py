@@ -29,6 +29,8 @@ NEXT_STEP = (
 )
 
 SCHEMA = "pmsmtool.params/1"
+ASSUMED = "assumed"
+"""Provenance of a value that nobody stated."""
 
 LUT_NAMES = ("lut.axis_x", "lut.axis_y", "lut.axis_z", "lut.i_d_a", "lut.i_q_a")
 """Axes (torque in N m; rpm or Wb; V) and tables (A peak, row-major x, y, z) of the reference look-up."""

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from benchmarks.random_drives import draw_drive
+from pmsmtool.commissioning.first_check import led_beyond
 from pmsmtool.commissioning.first_check_levels import _supply as link_row
-from pmsmtool.commissioning.first_check_levels import beyond, judge_kept, unmoved
+from pmsmtool.commissioning.first_check_levels import _whole, beyond, judge_kept, unmoved
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError, LimitExceeded
 from pmsmtool.experiments.first_turn import WAY_RAD, push_forth_and_back
@@ -155,6 +156,9 @@ def test_a_slow_current_loop_does_not_push_the_shaft_further() -> None:
 def test_a_limit_is_about_what_it_shows(quantity: str, turns: bool, about: str, verdict: str) -> None:
     row = beyond(LimitExceeded(quantity, 2.0, 1.0, "A"), turns)
     assert (row.looked_at, row.verdict) == (about, verdict)
+    if turns:  # the levels above push nothing; a rotor that swung for 15 s was WRONG there
+        due = WRONG if quantity == "current" else verdict
+        assert (led_beyond(LimitExceeded(quantity, 2.0, 1.0, "A")).verdict) == due
 
 
 def test_a_shaft_that_little_current_does_not_move_is_not_held() -> None:
@@ -164,6 +168,8 @@ def test_a_shaft_that_little_current_does_not_move_is_not_held() -> None:
     assert held.verdict == unmoved(error, False, 0.072).verdict == WRONG and held.likely == "a closed brake"
     assert unseen.verdict == NOT_SEEN and "1.5 % of the motor's rated current" in unseen.shown
     assert unseen.likely.startswith("friction, for want of current: a small drive for this motor")
+    for row, why in ((held, "mend what is wrong first"), (unseen, "the check ended before it")):
+        assert {other.looked_at: other.shown for other in _whole([row], False)}["encoder sign"] == why
 
 
 @pytest.mark.chain

@@ -5,15 +5,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 
 from pmsmtool.cia402 import HOMING_LOST
+from pmsmtool.design.ratings import GIVEN, rating_values, ratings
+from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError
 from pmsmtool.flash.plan import KIND_LEAST, Change, Plan, differences, make_plan, names_to_read
+from pmsmtool.flash.restore import tell_lacking
+from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import INCREMENTS, TORQUE_PER_AMPERE
-from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.params.parameter_set import ASSUMED, ParameterSet
 
 EPOS4 = load_family("epos4")
 PER_INCREMENT = next(
@@ -173,3 +178,21 @@ def test_differences_name_the_object_and_cut_long_bytes() -> None:
 )
 def test_what_follows_a_download_is_said_before_it(change: Change, store: bool, lines: list[str]) -> None:
     assert Plan((change, SAME)).after_lines(store=store) == lines
+
+
+def test_a_value_that_nobody_stated_leaves_a_drives_own_limit_alone() -> None:
+    """A Copley set to 1 s of its largest current was given 10 s, which no machine file stated."""
+    name, pairs = "motor.I_max_time_s", "motor.pole_pairs"
+    stated, own = ParameterSet({name: 10.0, pairs: 4.0}), reference_map()
+    assumed = replace(stated, provenance={name: ASSUMED})
+    copley, found = load_family("copley"), {name: u32(1000)[:2], pairs: u32(3)[:2]}
+    assert sorted(change.name for change in make_plan(copley, stated, found).changes) == [name, pairs]
+    plan = make_plan(copley, assumed, found)
+    assert [change.name for change in plan.changes] == [pairs] and plan.missing == plan.kept == (name,)
+    tell_lacking(Mock(map=copley), plan)  # no row of the map is wrong
+    assert "10 s is assumed, the machine file states no I_max_time_s" in plan.left_out()[0]
+    assert len(make_plan(own, assumed, dict(own.encode(stated))).entries) == 2, "the reference drive has no set-up tool"
+    source = load_machine_file("interior-2k2")
+    for time_s, due in ((None, ASSUMED), (3.0, GIVEN)):
+        file = replace(source, machine=replace(source.machine, I_max_time_s=time_s))
+        assert rating_values(file, ratings(file, 300.0))[name].method == due
