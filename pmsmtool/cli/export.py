@@ -60,8 +60,9 @@ def _written(command: Callable[..., bytes | str]) -> Callable[..., None]:
 def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
     """Read the set and say what the drive has no object for."""
     from pmsmtool.commissioning.parameter_source import load_parameters
+    from pmsmtool.flash.plan import without_assumed
 
-    wanted = load_parameters(design, drive_map)
+    wanted, kept = without_assumed(drive_map, load_parameters(design, drive_map))
     missing = drive_map.missing(wanted)
     made_on = _map_of_run(design)
     if drive_map.staging and made_on not in ("", drive_map.name):
@@ -73,8 +74,8 @@ def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
         out.warn(f"drive family {drive_map.name} has no object for {count}: {few}")
         if len(missing) > SHOWN:
             out.detail(f"no object for {', '.join(missing)}")
-    for name, why in drive_map.not_written(missing).items():
-        (out.note if name in drive_map.left_out else out.detail)(f"not written: {name}: {why}")
+    for name, why in {**drive_map.not_written(missing), **kept}.items():
+        (out.note if name in (*drive_map.left_out, *kept) else out.detail)(f"not written: {name}: {why}")
     for name in wanted.values:
         if name in drive_map.cells:
             out.detail(f"written: {drive_map.row_text(name)}")

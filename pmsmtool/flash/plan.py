@@ -162,8 +162,7 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
     wanted, given = _with_own_torque(drive_map, wanted, found)
     wanted, own = _with_own_increments(drive_map, wanted, found)
     given |= own
-    kept = {} if drive_map.staging else _kept(drive_map, wanted)
-    wanted = replace(wanted, values={name: value for name, value in wanted.values.items() if name not in kept})
+    wanted, kept = without_assumed(drive_map, wanted)
     encoded = drive_map.encode(wanted)
     held = drive_map.decode(encoded, given).values
     before = drive_map.decode({name: data for name, data in found.items() if name in drive_map.cells}, given).values
@@ -179,14 +178,16 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
     return Plan(tuple(entries), lacking, wanted.content_hash(), {**drive_map.left_out, **kept}, tuple(kept))
 
 
-def _kept(drive_map: DriveMap, wanted: ParameterSet) -> dict[str, str]:
-    """Return what another maker's drive keeps: a value that nobody stated must not lift a limit of its set-up."""
-    names = [name for name in wanted.values if name in drive_map.cells and wanted.provenance.get(name) == ASSUMED]
-    return {
-        name: f"{wanted.values[name]:g} {BY_NAME[name].unit} is assumed, the machine file states no "
-        f"{name.partition('.')[2]}: the drive keeps its own"
-        for name in names
+def without_assumed(drive_map: DriveMap, wanted: ParameterSet) -> tuple[ParameterSet, dict[str, str]]:
+    """Return the set without what another maker's drive keeps, and why: nobody stated it, and it may lift a limit."""
+    rows = () if drive_map.staging else drive_map.cells
+    kept = {
+        name: f"{value:g} {BY_NAME[name].unit} is assumed, the machine file states no {name.partition('.')[2]}: the "
+        "drive keeps its own"
+        for name, value in wanted.values.items()
+        if name in rows and wanted.provenance.get(name) == ASSUMED
     }
+    return replace(wanted, values={name: v for name, v in wanted.values.items() if name not in kept}), kept
 
 
 def _with_own_torque(

@@ -30,7 +30,7 @@ from pmsmtool.files import data_folder
 from pmsmtool.firmware.export_c import FLAGS
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.params.catalogue import CATALOGUE
-from pmsmtool.params.parameter_set import ParameterSet
+from pmsmtool.params.parameter_set import ASSUMED, ParameterSet
 from pmsmtool.run_directory import RunDirectory, new_record
 from tests.concise_dcf import read_concise
 from tests.firmware.exported_image import image_of_json
@@ -261,3 +261,16 @@ def test_params_is_what_tune_wrote(folder: Path, tmp_path: Path) -> None:
 
 def _contents(folder: Path) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def test_no_file_for_another_makers_drive_holds_a_value_that_nobody_stated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """0x2112 of a Copley, 10 s by assumption; `flash-params` leaves it alone, too."""
+    values = {"motor.I_max_time_s": 10.0, "motor.pole_pairs": 4.0}
+    path = tmp_path / "p.toml"
+    for how, count in (({}, 2), ({"motor.I_max_time_s": ASSUMED}, 1)):
+        path.write_text(ParameterSet(values, provenance=how).to_toml(), encoding="utf-8")
+        assert run(["export", "cdcf", str(path), "--map", "copley", "-o", str(tmp_path / f"{count}.bin")]) == 0
+        assert len(read_concise((tmp_path / f"{count}.bin").read_bytes())) == count
+    assert "not written: motor.I_max_time_s: 10 s is assumed" in capsys.readouterr().err
