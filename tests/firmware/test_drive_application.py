@@ -488,15 +488,8 @@ def test_quick_stop_ramps_the_current_and_then_takes_the_gates() -> None:
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
-@pytest.mark.parametrize("known_inertia", [0.0, 0.01])
-def test_quick_stop_brakes_a_turning_machine(direction: float, known_inertia: float) -> None:
-    bench = Bench(
-        40.0 * direction,
-        inertia=0.01,
-        motor__J_kgm2=known_inertia,
-        speed__K_p_nms_per_rad=0.5,
-        speed__K_i_nm_per_rad=5.0,
-    )
+def test_quick_stop_brakes_a_turning_machine(direction: float) -> None:
+    bench = Bench(40.0 * direction, inertia=0.01, speed__K_p_nms_per_rad=0.5, speed__K_i_nm_per_rad=5.0)
     bench.drive.reference.mode = MODE_SPEED
     bench.drive.reference.omega_M_ref = 40.0 * direction
     bench.run(50)
@@ -509,6 +502,25 @@ def test_quick_stop_brakes_a_turning_machine(direction: float, known_inertia: fl
     assert periods * bench.plant.T_s < 0.25
     assert abs(bench.omega_M) < 0.02 * 1200 * math.pi / 30
     assert bench.output.gates == 0
+
+
+@pytest.mark.parametrize("omega", [100.0, -2.0])
+@pytest.mark.parametrize("torque_most", [2.0, 50.0])
+@pytest.mark.parametrize(("K_p", "J"), [(0.1, 0.01), (0.0, 0.01), (0.0, 0.0)])
+def test_quick_stop_brakes_by_the_gain_that_is_known(K_p: float, J: float, torque_most: float, omega: float) -> None:
+    """Of the speed controller, else of the inertia, else of the speed range; at most rated and allowed torque."""
+    changes = {"speed__K_p_nms_per_rad": K_p, "motor__J_kgm2": J, "speed__tau_max_nm": torque_most}
+    bench = Bench(omega, **changes)
+    bench.drive.reference.mode = MODE_SPEED
+    bench.run(1)
+    bench.drive.quick_stop = 1
+    bench.run(1)
+    v = bench.values
+    most = min(torque_most, 1.5 * bench.p * v["motor.psi_f_wb"] * v["motor.I_nom_apk"])
+    of_range = most / (0.25 * v["motor.n_max_rpm"] * math.pi / 30.0)
+    gain = K_p or (J * v["encoder.pll_bandwidth_rad_s"] / 6.0 if J else of_range)
+    expected = -max(-most, min(gain * bench.drive.speed.omega, most))
+    assert bench.drive.applied.tau_ref == pytest.approx(expected, rel=1e-5)  # binary32
 
 
 def test_live_parameters_keep_the_controller_memory() -> None:

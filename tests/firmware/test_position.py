@@ -227,6 +227,24 @@ def test_a_limit_switch_stops_the_way_into_it_and_only_that(direction: int, prof
     assert axis.position.reference == 0 and not axis.flags & (Flag.LIMIT_SWITCH | Flag.MOVING)
 
 
+def test_an_axis_that_a_switch_stopped_waits_for_a_new_target() -> None:
+    """Not the mode nor the switch that opens again may start the way to the old target."""
+    axis = Axis()
+    axis.asked.profile, axis.asked.interval = 0, 0.2
+    axis.simulation.library.pmsm_sim_set_switches(axis.simulation.sim, -0.5, 0.5)
+    axis.go(1500)
+    axis.run(0.25)
+    held = axis.position.reference
+    assert axis.position.velocity == 0.0 and 0 < held < 1500
+    axis.asked.profile = 1
+    axis.simulation.library.pmsm_sim_set_switches(axis.simulation.sim, -4 * math.pi, 4 * math.pi)
+    axis.run(0.1)
+    assert axis.position.reference == held
+    axis.go(1500)
+    axis.run(0.1)
+    assert axis.position.reference > held
+
+
 def test_a_quick_stop_brakes_a_move_and_the_next_one_begins_at_rest() -> None:
     axis = Axis()
     axis.go(100000)
