@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
 """Gains of an axis: the stiffest control whose margins hold over the whole tolerance box.
 
-Maximised is K_i K_v^3, of a speed loop without position loop K_i times its crossover. The inverse of K_i K_v is the
+Maximised is K_i K_v, of a speed loop without position loop K_i times its crossover. The inverse of K_i K_v is the
 integral of the position error after a step of load torque (K. J. Astrom, H. Panagopoulos, T. Hagglund, Automatica 34
-(1998) 585). The error of a move goes with 1 / K_v: v / K_v where nothing feeds the speed forward, else a t / K_v, where
-the loop sees the speed t late. So K_v counts thrice: half of the stiffness is given for 1.4 times K_v. Constraints are
-least phase margin and largest |S|, of the speed loop alone and of both loops together.
+(1998) 585). In a cascade the error of a move goes with 1 / K_v, too: v / K_v where nothing feeds the speed forward,
+else a t / K_v, where the loop sees the speed t late. So K_v counts thrice there, and K_i K_v^3 is maximised: half of
+the stiffness is given for 1.4 times K_v. One PID derives demand and position alike. Constraints are least phase margin
+and largest |S|, of the speed loop alone and of both loops together.
 
 A loop is looked at on a grid of frequencies that has points inside every resonance: those of the path and those of the
 closed loop, whose poles are known. So no narrow peak lies between two points. Extrema are looked at again between their
@@ -208,7 +209,8 @@ def stiffest(box: Box, limits: Limits, *, notch: bool = True, loops: Sequence[Lo
         Those that these gains decide; of ``speed`` alone K_v is not looked at.
     """
     path = box.path
-    positions, power = (POSITION_RATIOS, 3) if "position" in loops else (POSITION_RATIOS[:1], 1)
+    positions = POSITION_RATIOS if "position" in loops else POSITION_RATIOS[:1]
+    power = 3 if "position" in loops and path.structure == "cascade" else 1
     best: AxisGains | None = None
     for shape in sorted(
         itertools.product(INTEGRAL_RATIOS, positions, _notches(path, notch)), key=lambda one: one[0] * one[1] ** power

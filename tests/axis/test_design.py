@@ -25,7 +25,7 @@ from pmsmtool.axis.drive import (
     cases,
     from_pid,
 )
-from pmsmtool.axis.loops import AxisGains, best_share, following_error, lifted
+from pmsmtool.axis.loops import AxisGains, Structure, best_share, following_error, lifted
 from pmsmtool.axis.move import Profile, plan
 from pmsmtool.axis.search import LOOPS, Box, Limits, _fastest, axis_margins, stiffest
 from pmsmtool.axis.stored_gains import at_least_as_good
@@ -123,19 +123,26 @@ def test_a_shaft_with_play_is_no_rigid_one() -> None:
     assert any("swinging at 225 Hz" in case for case in swings), swings
 
 
-def test_the_gains_found_are_the_best_of_all_shapes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A shape whose fastest gains lie between the best so far and the next of the grid was left out: 30 % here."""
+@pytest.mark.parametrize(("structure", "power", "ratios"), [("cascade", 3, (3.0,)), ("pid", 1, (3.0, 4.0))])
+def test_the_gains_found_are_the_best_of_all_shapes(
+    monkeypatch: pytest.MonkeyPatch, structure: Structure, power: int, ratios: tuple[float, ...]
+) -> None:
+    """A shape whose fastest gains lie between the best so far and the next of the grid was left out: 30 % here.
+
+    K_i K_v^3 of one PID of an EPOS4 made its following error 1.1 to 2.0 times that with K_i K_v.
+    """
     made = designed("epos4", 0.0, 0.0)
     drive = AxisDrive("drive", frozenset((*SPEED, CASCADE[0])), own_core=False)
     path, _ = axis_path(made, ASKED, drive, mechanics_of(made.machine))
-    box = Box(path, cases(made.machine, drive))
+    box = Box(replace(path, structure=structure), cases(made.machine, drive))
     monkeypatch.setattr(search, "INTEGRAL_RATIOS", (6.0, 9.0))
-    monkeypatch.setattr(search, "POSITION_RATIOS", (3.0,))
-    found = [_fastest(box, Limits(), (ratio, 3.0, Notch()), 0.0, LOOPS) for ratio in (6.0, 9.0)]
-    best = stiffest(box, Limits())
-    most = max(gains.K_i * gains.K_v**3 for gains in found if gains is not None)
-    assert best.K_i * best.K_v**3 == pytest.approx(most, rel=FINEST)
-    assert box.holds(best, Limits())
+    monkeypatch.setattr(search, "POSITION_RATIOS", ratios)
+    shapes = [(integral, ratio, Notch()) for integral in (6.0, 9.0) for ratio in ratios]
+    found = [_fastest(box, Limits(), shape, 0.0, ("position",)) for shape in shapes]
+    best = stiffest(box, Limits(), loops=("position",))
+    most = max(gains.K_i * gains.K_v**power for gains in found if gains is not None)
+    assert best.K_i * best.K_v**power == pytest.approx(most, rel=FINEST)
+    assert box.holds(best, Limits(), ("position",))
 
 
 FINEST = 0.01
