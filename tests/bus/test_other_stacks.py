@@ -28,6 +28,7 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.bus.nmt import NmtCommand, find_nodes, reset_node, send_nmt
 from pmsmtool.bus.sdo import Mode, SdoChannel
 from pmsmtool.errors import DriveTimeout, SdoAbort
+from tests.contract.stacks import END_S
 
 pytestmark = pytest.mark.wall_clock
 
@@ -59,7 +60,7 @@ def local_node(request: pytest.FixtureRequest) -> Iterator[canopen.LocalNode]:
         variable.data_type, variable.default = datatypes.UNSIGNED32, default
         dictionary.add_object(variable)
     network = canopen.Network()
-    network.NOTIFIER_CYCLE = 0.05
+    network.NOTIFIER_CYCLE = END_S
     network.connect(interface="virtual", channel=request.node.name, ignore_config=True)
     node = network.create_node(NODE, dictionary)
     node.nmt.state = "PRE-OPERATIONAL"
@@ -106,6 +107,7 @@ def durand_node(request: pytest.FixtureRequest) -> Iterator[Any]:
     variable = importlib.import_module("durand.object_dictionary").Variable
     bus = can.Bus(interface="virtual", channel=request.node.name, ignore_config=True)
     network = durand.CANBusNetwork(bus)
+    network._notifier.timeout = END_S
     node = durand.MinimalNode(network, NODE)
     node.object_dictionary[NUMBER[0]] = variable(kinds.UNSIGNED32, "rw", value=0)
     node.object_dictionary[BLOB[0]] = variable(kinds.DOMAIN, "rw", value=b"")

@@ -101,22 +101,14 @@ def _durand_node(network: Any) -> Any:
 @contextlib.contextmanager
 def durand_peer() -> Iterator[Peer]:
     """Yield a slave of the stack ``durand``."""
-    from durand.network import CANBusNetwork, NodeListener
+    from durand.network import CANBusNetwork
     from durand.scheduler import set_scheduler
-
-    class Network(CANBusNetwork):  # type: ignore[misc]
-        """As the stack's own, but it looks more often whether it shall end."""
-
-        def __init__(self, bus: can.BusABC) -> None:
-            self._bus = bus
-            self.lock = threading.Lock()
-            self.subscriptions: dict[int, Callable[[int, bytes], None]] = {}
-            self._notifier = can.Notifier(bus, (NodeListener(self),), END_S)
 
     timers = _Timers()
     set_scheduler(timers)
     with _virtual() as (bus, connection):
-        network = Network(bus)
+        network = CANBusNetwork(bus)
+        network._notifier.timeout = END_S
         try:
             _durand_node(network)
             yield Peer(connection)
