@@ -228,7 +228,8 @@ def test_a_stop_whose_answers_begin_and_never_end_does_not_wait_for_them() -> No
 
 @pytest.mark.chain
 @pytest.mark.parametrize("greeting", [b"", b"<", b"< hi >", b"HTTP/1.1 400 Bad Request\r\n\r\n\x1b[2J"])
-def test_a_server_that_does_not_speak_socketcand_is_given_up(greeting: bytes) -> None:
+def test_a_server_that_does_not_speak_socketcand_is_given_up(greeting: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pmsmtool.bus.connect._SERVER_TIMEOUT_S", 0.2)  # 2 s: two of the greetings leave it waiting
     with socket.create_server(("127.0.0.1", 0)) as server:
         kept = []
 
