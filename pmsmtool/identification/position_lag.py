@@ -8,15 +8,19 @@ demanded and seen speed apart:
 
     i = a (K_v e + f omega_ref - omega) + b (K_v int e dt + f theta_ref - theta) + c,
 
-so that f is the coefficient of omega_ref over that of -omega. A feed-forward that has an object is 0 for this; what it
-counts then follows from the lag with it over that without. A loop whose lag does not settle (an integral part of the
-position, or one controller of the position) is none of this kind.
+so that f is the coefficient of omega_ref over that of -omega. A drive takes its speed from counts, whose noise stands
+in position and current alike: least squares then find a feed-forward that is none. Where they find one, two-stage least
+squares decide, by what the demand alone makes of the position, and with the lag's own gain for K_v / (1 - f).
+
+A feed-forward that has an object is 0 for this; what it counts then follows from the lag with it over that without. A
+loop whose lag does not settle (an integral part of the position, or one controller of the position) is none of this
+kind.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -38,12 +42,15 @@ LEAST_COUNTS = 20.0
 """Least lag, in counts of the position."""
 SETTLED = 0.03
 """Largest difference of the lag in both quarters that count, relative."""
+INSTRUMENT_WINDOW_S, FILTERS, GRID_S = 0.08, 3, 1e-3
+"""The same beside instruments, where the noise of a counted speed is as large as the rest; how often the demand is
+filtered by the lag's gain for them, and the step for that (s)."""
 ALIKE = 4.0
 """Windows after one another that the rest of the current is alike in: cogging and friction are no noise."""
 LATE_S = 0.5e-3
 """Standard deviation of the time between demand and position of one sample: half a period of a loop at 1 kHz."""
 AGREES = 0.25
-"""Largest share that is still none: a slow speed loop and its filter made up to -0.10 of 0."""
+"""Largest share, with its standard deviation, that is still none: a slow speed loop and its filter made up to -0.10."""
 CHANGE_STD = 0.02
 """Of a ratio of two gains of one drive (relative)."""
 UNIT = "1/s"
@@ -93,6 +100,8 @@ def position_lag(trace: Trace, rad_per_count: float) -> PositionLag:
     gain = float(np.mean(speeds)) / lag
     spread = float(np.std(lags[::2] + lags[1::2], ddof=1)) / (2.0 * lag)
     forward, forward_std = _fed_forward(trace)
+    if abs(forward) > AGREES:
+        forward, forward_std = _fed_forward_by_demand(trace, gain)
     return PositionLag(gain, math.hypot(spread, drift, LATE_S * gain), forward, forward_std)
 
 
@@ -138,22 +147,46 @@ def _even_parts(t: Array, demand: Array) -> Iterator[tuple[int, int]]:
 def _fed_forward(trace: Trace) -> tuple[float, float]:
     """Return the share of the demanded speed that is fed forward, and its standard deviation."""
     t, demand, position = trace.t_s, trace["theta_ref_rad"], trace["theta_m_rad"]
-    grid = np.arange(t[0] + WINDOW_S, t[-1] - WINDOW_S, 0.5 * WINDOW_S)
+    columns = (demand, -position, *(_integral(t, x) for x in (_integral(t, demand - position), demand, position)))
+    matrix = _changes(t, columns, WINDOW_S)
+    return _ratio(matrix, matrix, _changes(t, [_integral(t, trace["i_q_a"])], WINDOW_S)[:, 0])
 
-    def change(x: Array) -> Array:
-        return np.interp(grid + 0.5 * WINDOW_S, t, x) - np.interp(grid - 0.5 * WINDOW_S, t, x)
 
-    lag = demand - position
-    columns = [
-        change(demand), -change(position), *(change(_integral(t, x)) for x in (_integral(t, lag), demand, position)),
-        np.ones_like(grid),
-    ]  # fmt: skip
-    matrix = np.stack(columns, axis=1)
+def _fed_forward_by_demand(trace: Trace, gain_per_s: float) -> tuple[float, float]:
+    """Return the same by instruments without the noise of the position; ``gain_per_s`` of the lag is K_v / (1 - f)."""
+    from scipy.signal import lfilter
+
+    t, demand = trace.t_s, trace["theta_ref_rad"]
+    keep, grid = math.exp(-gain_per_s * GRID_S), np.arange(t[0], t[-1] + GRID_S, GRID_S)
+    filtered = [np.interp(grid, t, demand) - demand[0]]
+    for _ in range(FILTERS):
+        filtered.append(lfilter([1.0 - keep], [1.0, -keep], filtered[-1]))
+    instruments = [np.interp(t, grid, x) for x in filtered]
+    by_lag = gain_per_s * _integral(t, demand - trace["theta_m_rad"])
+    pair = demand - by_lag, by_lag - trace["theta_m_rad"]
+    matrix = _changes(t, (*pair, *(_integral(t, x) for x in pair)), INSTRUMENT_WINDOW_S)
+    known = _changes(t, (*instruments, _integral(t, demand)), INSTRUMENT_WINDOW_S)
+    basis = np.linalg.qr(known)[0]
+    current = _changes(t, [_integral(t, trace["i_q_a"])], INSTRUMENT_WINDOW_S)[:, 0]
+    return _ratio(matrix, basis @ (basis.T @ matrix), current)
+
+
+def _changes(t: Array, signals: Sequence[Array], window_s: float) -> Array:
+    """Return what signals change by over windows, one column each, and a column of ones."""
+    grid = np.arange(t[0] + window_s, t[-1] - window_s, 0.5 * window_s)
+    ends = [[np.interp(grid + side * window_s, t, x) for x in signals] for side in (0.5, -0.5)]
+    return np.column_stack([*(after - before for after, before in zip(*ends, strict=True)), np.ones_like(grid)])
+
+
+def _ratio(matrix: Array, projected: Array, current: Array) -> tuple[float, float]:
+    """Return the first coefficient over the second, and its standard deviation, by least squares in two stages.
+
+    ``projected``: the columns as the instruments explain them; the columns themselves for one stage.
+    """
     size = np.sqrt(np.mean(matrix**2, axis=0))
-    current = change(_integral(t, trace["i_q_a"]))
-    found, *_ = np.linalg.lstsq(matrix / size, current, rcond=None)
+    found, *_ = np.linalg.lstsq(projected / size, current, rcond=None)
     rest = current - matrix / size @ found
-    covariance = np.linalg.inv((matrix / size).T @ (matrix / size)) * float(np.mean(rest**2)) * ALIKE
+    covariance = np.linalg.inv((projected / size).T @ (projected / size)) * float(np.mean(rest**2)) * ALIKE
     of_demand, of_speed = (float(found[k] / size[k]) for k in (0, 1))
     share = of_demand / of_speed
     gradient = np.array([1.0 / size[0], -share / size[1]]) / of_speed
@@ -184,7 +217,7 @@ def position_scale(
     forward = float(weights @ [lag.forward, changed[1].forward] / weights.sum())
     forward_std = float(weights.sum()) ** -0.5
     per_count = 0.5 * (lag.gain_per_s / counts + changed[1].gain_per_s / changed[0])
-    known = forward_is_zero and abs(forward) < AGREES
+    known = forward_is_zero and abs(forward) + forward_std < AGREES
     half = NORMAL_95 * math.hypot(lag.std, seen - asked, 0.0 if known else math.hypot(forward_std, forward))
     if half > WIDEST:
         fed = f"{100.0 * forward:.0f} +-{100.0 * NORMAL_95 * forward_std:.0f} % of the speed fed forward"
