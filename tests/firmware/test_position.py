@@ -17,6 +17,7 @@ from pmsmtool.sim.kernel import Part, Signal, Simulation, Truth
 from pmsmtool.sim.node.drive_core import HomingPhase as Phase
 from pmsmtool.sim.node.drive_core import PositionFlag as Flag
 from pmsmtool.sim.simulated_machine import build_setup
+from pmsmtool.units import rad_s_from_rpm
 
 MODE_POSITION = 6
 INCREMENTS = 4096
@@ -190,6 +191,7 @@ def test_a_saturated_loop_does_not_wind_up() -> None:
     axis.go(20 * INCREMENTS)
     axis.run(2 * axis.T)
     assert axis.flags & Flag.SATURATED
+    assert axis.position.omega_ref == pytest.approx(rad_s_from_rpm(200.0))
     furthest = max(-row[2] for row in axis.run(7.5))
     assert not axis.flags & Flag.SATURATED and abs(axis.position.error) <= 2
     assert furthest < OVERSHOOT * 20 * INCREMENTS
