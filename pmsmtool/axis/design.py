@@ -46,6 +46,11 @@ TORQUE_SHARE = 0.6
 """Torque of the acceleration, of the largest one beyond friction: the rest is for the loops."""
 WAY_RAD = math.pi
 """Way of the move whose following error is predicted, at these limits."""
+FILTER_SHARE, FILTER_WORTH = 0.1, 2.0
+"""Low-pass of the speed that is tried where a resonance limits a drive without a notch, of its frequency, and how many
+times the position gain it must give to be named."""
+RESONANCE_LIMITS = 0.1
+"""Crossover K_p / J of the speed times its lag below which a resonance limits it (0.39 on rigid shafts, measured)."""
 OF_TUNED_SPEED = ("notch at", "no notch at", "speed loop of")
 """How notes on the speed loop of `tune` begin: the axis has another."""
 RAMP = 4.0
@@ -138,6 +143,8 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
         position = stiffest(box, limits, notch=notch, loops=("position",))
     else:
         speed = position = stiffest(box, limits, notch=notch)
+    filtered = _filter_worth(box, limits, position, drive)
+    notes = (*notes, *([filtered] if filtered else []))
     torque = ratings_of(design).tau_max_nm
     if drive.torque_nm is not None and drive.torque_nm < torque:
         share, torque = drive.torque_nm / torque, drive.torque_nm
@@ -190,11 +197,31 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
         raise DesignInfeasible(
             f"with margins over the tolerance box a move of half a turn stays {math.degrees(behind):.3g} deg behind",
             where="axis", likely="a resonance that is little damped, or of an unknown damping, without a notch",
-            hint="measure it with `identify frf`, ask for smaller margins, or keep the gains that the drive holds",
+            hint=filtered or "measure it with `identify frf`, ask for smaller margins, or keep the drive's own gains",
         )  # fmt: skip
     base = replace(base, facts={**base.facts, **predicted})
     values = axis_values(source, speed, position, share, profile, drive, how)
     return AxisDesign(judged_design(base, values, box, speed, position), box, speed, position)
+
+
+def _filter_worth(box: Box, limits: Limits, gains: AxisGains, drive: AxisDrive) -> str:
+    """Return what a low-pass of the speed gives where a resonance limits a cascade without a notch, else nothing."""
+    path = box.path
+    slow = gains.K_p / path.shaft.J * path.lag_s < RESONANCE_LIMITS
+    if NOTCH[0] in drive.offers or path.structure != "cascade" or path.filter_hz or not (path.shaft.elastic and slow):
+        return ""
+    smoothed = replace(path, filter_hz=FILTER_SHARE * path.shaft.resonance_hz)
+    try:
+        more = stiffest(Box(smoothed, box.cases), limits, notch=False).K_v / gains.K_v
+    except DesignInfeasible:
+        return ""
+    if more < FILTER_WORTH:
+        return ""
+    hertz = f"{smoothed.filter_hz:.2g}"
+    return (
+        f"the resonance limits the gains: with a low-pass of {hertz} Hz on the speed, set in the drive, the position "
+        f"gain can be {more:.2g} times as large (--speed-filter-hz {hertz})"
+    )
 
 
 def judged_design(

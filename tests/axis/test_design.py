@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 from dataclasses import replace
 from functools import cache
@@ -287,6 +288,22 @@ def test_what_cannot_be_designed_is_refused() -> None:
     path, _ = axis_path(tune(source), ASKED, drive, mechanics_of(source))
     with pytest.raises(DesignInfeasible, match="no gains have 120 degree"):
         stiffest(Box(path, ()), Limits(120.0, 6.0))
+
+
+@pytest.mark.chain
+def test_a_filter_that_a_resonance_needs_is_named() -> None:
+    """A load at 292 Hz, 16 times the motor, damping 1.7 %: K_v was 2.2 1/s, and nothing said what would help."""
+    source, drive = loaded(1224)[1], AxisDrive("drive", frozenset((*SPEED, CASCADE[0])), own_core=False)
+    tuned = tune(source, TuneRequest())
+    plain = with_axis(tuned, ASKED, drive)
+    (note,) = (note for note in plain.design.notes if "low-pass" in note)
+    said = re.search(r"low-pass of (\S+) Hz .* can be (\S+) times .*--speed-filter-hz (\S+)\)", note)
+    assert said is not None and said[1] == said[3]
+    filtered = with_axis(tuned, AxisRequest(speed_filter_hz=float(said[3])), drive)
+    assert filtered.position.K_v / plain.position.K_v == pytest.approx(float(said[2]), rel=0.05)  # two digits of Hz
+    assert float(said[2]) > 2.0 and not any("low-pass" in note for note in filtered.design.notes)
+    rigid = with_axis(tune(machine(), TuneRequest()), ASKED, drive)
+    assert not any("low-pass" in note for note in rigid.design.notes)
 
 
 @pytest.mark.chain
