@@ -327,6 +327,14 @@ def test_drag_over_the_square_of_the_speed_is_told_from_friction() -> None:
 
 
 @pytest.mark.chain
+def test_a_drag_that_is_nearly_lost_in_the_noise_is_in_the_intervals() -> None:
+    """Of three standard deviations; the worst of ten realisations. It was left out, and B 2.8 intervals off."""
+    found = estimate(with_drag(run_of(np.random.default_rng(106)), 3.4e-8))
+    for value, true in ((found.B, B), (found.tau_c, TAU_C)):
+        assert abs(value.value - true) < 1.8 * 1.96 * value.std  # measured 1.58
+
+
+@pytest.mark.chain
 def test_friction_that_falls_with_the_speed_is_no_drag(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before, a drag of 15 standard deviations: at ten times this speed 30 times the friction."""
     monkeypatch.setattr(f"{__name__}.B", 0.0)

@@ -74,9 +74,9 @@ RIPPLE_MOST = 0.15
 """Largest deviation of a block's torque, of the push's: above, the shaft is not what the model says."""
 UNEXPLAINED = 2.0
 """Growth of the torque's noise in pushes or coasting from which on it is more than the model's."""
-DRAG_PENALTY = 9.0
-"""Price of the drag in the information criterion: it is there from three standard deviations on. With 16 one of 3.1 was
-left out, and B was 26 % off with an interval of 5 %; a shaft without drag has the same total intervals with both."""
+DRAG_PENALTY = 6.0
+"""Price of the drag in the information criterion: half from 2.4 standard deviations on. With 9 one of 1.9 was left out,
+B 8 times too large at +-48 %; with 4 a shaft without drag has up to 6 times the deviation of B, with 6 up to 3."""
 NOTED = 0.01
 """Deviation of a block's torque, of the push's, from which on a reader is told why the intervals are wide; the default
 machine has 0.0035 to 0.0039."""
