@@ -5,14 +5,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from pmsmtool.estimators.current_sensors import Noise
+from pmsmtool.estimators.injection.sampling_instant import Sampling
 from pmsmtool.estimators.inverter_error import InverterCurve
-from pmsmtool.identification.mechanics import HARMONIC_PARTS, _harmonic_current
+from pmsmtool.identification.mechanics import HARMONIC_PARTS, _drag_of_unknown_instant, _harmonic_current
 from pmsmtool.trace import Trace
 
 R, K_P, PSI, PAIRS, SIGMA_A, ROWS = 0.5, (0.8, 1.2), 0.05, 4, 0.01, 4000
@@ -74,3 +75,17 @@ def test_the_inverter_drives_its_own_harmonics() -> None:
         abs(float(np.mean(_harmonic_current(driven, 1, PAIRS, known(c))[-500:]))) for c in (None, curve)
     )
     assert with_it < 0.1 * without  # measured 0.006 of it
+
+
+def test_what_eddy_currents_hide_of_the_samples_instant_is_in_the_friction() -> None:
+    """A sample 7 us late at w shows w psi 7 us/L_q too much; the torque of that over the speed is a part of B."""
+    psi, L_q, pole_pairs, late_s = 0.02, 4.7e-4, 13, -7e-6
+    two = 1.5 * pole_pairs * psi * (pole_pairs * psi * 7e-6 / L_q)
+    flux = SimpleNamespace(psi_measured=SimpleNamespace(value=psi))
+    for sampling, shown_s, expected in ((None, late_s, 0.5 * two), (Sampling(), late_s, 0.0), (None, None, 0.0)):
+        shown = None if shown_s is None else SimpleNamespace(value_s=shown_s)
+        result = SimpleNamespace(flux=flux, shown=shown, inductance=SimpleNamespace(sampling=sampling))
+        assert _drag_of_unknown_instant(cast(Any, result), pole_pairs, L_q) == pytest.approx(expected)
+    refused = SimpleNamespace(flux=flux, shown=SimpleNamespace(value_s=late_s), inductance=None)
+    assert _drag_of_unknown_instant(cast(Any, refused), pole_pairs, L_q) == pytest.approx(0.5 * two)
+    assert _drag_of_unknown_instant(cast(Any, refused), pole_pairs, 0.0) == 0.0
