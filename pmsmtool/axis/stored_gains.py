@@ -44,7 +44,7 @@ def at_least_as_good(made: AxisDesign, stored: Mapping[str, float], drive: AxisD
     before, _ = move_peaks(box.path, box.plant, position, move, stored, made.friction_nm)
     told: dict[str, Scalar] = {
         "axis_error_rad": after, "axis_stored_error_rad": before, "axis_stored_phase_least_deg": phase,
-        "axis_stored_S_peak_db": peak, "axis_stored_gains": "not kept: the designed ones follow as well",
+        "axis_stored_S_peak_db": peak, "axis_stored_gains": "not kept: the designed ones follow at least as well",
     }  # fmt: skip
     if all(abs(stored[name] / design[name] - 1.0) < AS_WELL for name in gain_rows(drive)):
         return made.noted(told | {"axis_stored_gains": "as designed"}, "the drive holds the designed gains already")
