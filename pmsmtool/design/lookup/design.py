@@ -287,9 +287,10 @@ class _Problem:
         return (np.linspace(low, top, FIRST_SPEEDS), np.linspace(low, top, points)), notes
 
     def _reachable(self, speed_rpm: float) -> bool:
+        """Whether zero torque is admissible; beyond, the voltage allows braking alone, and its range may jump."""
         omega = electrical_speed(self.machine, [np.float32(speed_rpm)])
         bounds = self._limits_at(omega, float(self.V_max.min()))
-        return not math.isnan(float(bounds.least_nm[0, 0]))
+        return bool(bounds.least_nm[0, 0] <= 0.0 <= bounds.largest_nm[0, 0])
 
     def _limits_at(self, omega_e: Array, V: float) -> TorqueLimits:
         return torque_limits(self.machine, omega_e, [V], self.rated.I_max_apk, self.rated.i_d_min_a)
@@ -318,4 +319,4 @@ class _Problem:
 
 
 def _unreachable(n_max: float, wanted: float) -> str:
-    return f"beyond {n_max:.5g} rpm (of {wanted:.5g} rpm) no current keeps the voltage limit: the table ends there"
+    return f"beyond {n_max:.5g} rpm (of {wanted:.5g} rpm) the voltage allows no zero torque: the table ends there"

@@ -220,7 +220,7 @@ def refined_table(
         f"{nodes} nodes keep the torque within {error.torque_nm:.3g} N m and the "
         f"voltage within {error.voltage_v:.3g} V; asked for: {bounds.torque_nm:.3g} N m, {bounds.voltage_v:.3g} V",
         where=f"look-up table ({bounds.stored}, {bounds.capacity_words} words)",
-        likely="the drive's memory for tables is full",
+        likely="the drive's memory for tables is full, or the admissible torque jumps within the range of speed",
         hint=f"ask for larger bounds{', take int16' if bounds.stored == 'float32' else ''}, or reduce the range of "
         "torque, speed or DC-link voltage",
     )
@@ -291,12 +291,12 @@ def _halved(axis: Array, split: NDArray[np.bool_]) -> Array:
 
 
 def largest_speed_rpm(reachable: Callable[[float], bool], n_max_rpm: float) -> float:
-    """Return the largest speed up to n_max at which an operating point exists (rpm), a binary32 number.
+    """Return the largest speed up to n_max that is reachable (rpm), a binary32 number.
 
     Parameters
     ----------
     reachable : callable
-        Whether a speed (rpm) has a point.
+        Whether a speed (rpm) is.
     n_max_rpm : float
         Largest speed of interest (rpm).
     """
