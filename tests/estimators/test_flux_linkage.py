@@ -387,6 +387,27 @@ def test_a_speed_that_lags_while_the_shaft_slows_down_is_put_right() -> None:
     assert right / wrong == pytest.approx(1.0 / (1.0 - 0.4 * 3e-3), rel=1e-4)
 
 
+def test_what_an_old_angle_hides_of_psi_is_in_its_interval() -> None:
+    """The voltage of the magnets leaves the q axis by w t: psi is low by its cosine, as no late sample makes it."""
+    trace, old_s = _windows(lambda i: PSI + 4e-3 * i), 3.0 * T_S
+    ahead = np.exp(1j * trace["omega_e_rad_s"] * old_s)
+    pairs = [("u_d_v", "u_q_v"), *((f"i_d{k}_a", f"i_q{k}_a") for k in ("", "_first", "_second"))]
+    turned = {d: (trace[d] + 1j * trace[q]) * ahead for d, q in pairs}
+    shown = {name: part for d, q in pairs for name, part in ((d, turned[d].real), (q, turned[d].imag))}
+    pulses = Modulation(400.0, (4e-3, 5e-3), T_S, 0.0)
+    rows, step_s = _changed(trace, **shown), 0.01 * T_S
+    found, plain, later = (
+        estimate_flux_linkage(rows, R, period_s=T_S, modulation=pulses, sampling=Sampling(late_s))
+        for rows, late_s in ((rows, 0.0), (trace, 0.0), (rows, step_s))
+    )
+    assert found.shown is not None and found.shown.value_s == pytest.approx(old_s, rel=0.1)
+    lost = PSI - found.psi_measured.value
+    assert lost > 3e-3 * PSI
+    as_late = (later.psi_measured.value - found.psi_measured.value) / step_s * old_s
+    added = found.psi_measured.systematic - plain.psi_measured.systematic
+    assert added == pytest.approx(abs(lost - as_late), rel=0.05)
+
+
 @pytest.mark.parametrize("lost", [0.05, 0.1, 0.2, 0.3])
 def test_a_shaft_that_slows_down_in_a_window_costs_nothing(lost: float) -> None:
     """The mean voltage belongs to the mean speed: the doubt of the lag alone grows, 0.02 % per 10 % lost."""

@@ -214,16 +214,16 @@ def estimate_flux_linkage(
     fitted = math.hypot(math.cos(eps) * even.std_wb, math.sin(eps) * d_std[1])
     std = math.hypot(fitted, model_std)
     T = float(np.mean(speeds["T_magnet_c"]))
-    L_d = _rough_L_d(rows, np.nonzero(rows.is_d)[0])
-    driven = driven_flux_linkage(rows, L_d, x2, even.curvature, lag_s, tolerance, T)
+    driven = driven_flux_linkage(rows, _rough_L_d(rows, rows.is_d), x2, even.curvature, lag_s, tolerance, T)
     apart = 0.0
     if driven is not None:
         alone = Estimate(psi, std, 0.0, "Wb")
         if not cross_check("psi_f_wb_driven", "psi_f_wb", driven, alone, tolerance.voltage_scale_std).agrees:
             apart = abs(driven.value - psi)
     std = math.hypot(std, apart)
-    # an old angle shows what a late sample does, and wants less of a correction
-    if_old = 0.0 if shown is None else per_instant * max(0.0, shown.value_s)
+    # an angle old by t shows what a late sample does, but wants less of a correction, and psi was cos(w t) psi on q
+    old_s = 0.0 if shown is None else max(0.0, shown.value_s)
+    if_old = per_instant * old_s - even.change(0.5 * rows.u_q * (rows.w * old_s) ** 2)
     measured = Estimate(
         value=psi,
         std=std,
@@ -417,7 +417,7 @@ def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
                  row=np.asarray(share @ np.stack([hat[0] for hat in hats]) @ reduce))  # fmt: skip
 
 
-def _rough_L_d(rows: Corrected, which: NDArray[np.int64]) -> float:
+def _rough_L_d(rows: Corrected, which: NDArray[np.int64 | np.bool_]) -> float:
     """L_d from u_q (H): the two windows of a pair differ a little in speed."""
     w, across = rows.w[which], rows.w[which] * rows.i_d[which]
     columns = np.stack([w, across, np.sign(across)], axis=1)
