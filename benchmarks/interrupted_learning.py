@@ -35,14 +35,17 @@ from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.flash.gain_journal import any_left
 from pmsmtool.identification.speed_loop_response import SpeedLoop
 from pmsmtool.machine.machine_file import dump_machine_file
-from pmsmtool.measurement import learn_gains, learn_position_gain
+from pmsmtool.measurement import learn_current_gains, learn_gains, learn_position_gain
 from pmsmtool.measurement.changed_gains import BACK, GAIN, INTEGRAL
+from pmsmtool.measurement.learn_current_gains import CURRENT_GAIN
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.units import rad_s_from_rpm
 
 LEARN_WAYS = ("kill", "adapter", "freeze", "ctrl-c", "error", "power")
-SHORT = {(learn_gains, "LEAST_S"): 0.6, (learn_position_gain, "WAY_RAD"): 9.0}
+SHORT = {
+    (learn_gains, "LEAST_S"): 0.6, (learn_position_gain, "WAY_RAD"): 9.0, (learn_current_gains, "RECORDS"): 1,
+}  # fmt: skip
 """What makes a run shorter."""
 
 
@@ -77,6 +80,8 @@ def learning(table: str, seed: int, how: str, moment: int | None) -> Learning:
 
         def counts() -> list[bytes]:
             places = [face.gains.gain, face.gains.integral, face.gains.position, face.gains.forward]
+            if face.gains.current is not None:
+                places += [face.gains.current.gain, face.gains.current.integral]
             return [face.behind.dictionary.find(*place).value for place in places if place is not None]
 
         for (module, name), value in {**SHORT, (learn_gains, "fit_speed_loop"): truth}.items():
@@ -98,6 +103,8 @@ def learning(table: str, seed: int, how: str, moment: int | None) -> Learning:
         names = [f"{name}=0x{index:04X}:{sub:02X}" for name, (index, sub) in places.items()]
         if face.gains.position is not None:
             names.append("position.K_p_per_s=0x{:04X}:{:02X}".format(*face.gains.position))
+        if face.gains.current is not None:
+            names.append(CURRENT_GAIN)
         with watch.on():
             code, told = commanded("map", "learn", *names, "--machine", "told.toml", *on)
             watch.over = True

@@ -56,12 +56,12 @@ def learn_command(
     output: Path | None,
     map_file: Path | None,
 ) -> None:
-    """Find out what one count of a gain of the speed or position loop is worth on this drive, by its response.
+    """Find out what one count of a gain of the speed, position or current loop is worth, by its response.
 
     The gains are changed by known ratios while the voltage is off, the speed is stepped, and the answers say scale and
     form of both gains, and whether shown currents are peak or rms; moves at even speed say what a position gain counts
-    that its map names without a unit. What the data do not decide stays unknown. The drive keeps its own gains: they
-    are restored when the command ends, and if it is killed, by the next connection.
+    that its map names without a unit, a recorder at loop rate what current gains do. What is not decided stays unknown.
+    The drive keeps its own gains: they are restored when the command ends, and if it is killed, by the next connection.
 
     The shaft must be free and without load. Scales rest on the inertia in the machine file and on its standard
     deviation in [std]; without one nothing that rests on the inertia is decided. Published scales of the map are
@@ -74,15 +74,10 @@ def learn_command(
     from pmsmtool.flash.map_gate import check_motion
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, gain_address, gain_object, refuse_unsafe
+    from pmsmtool.measurement.learn_current_gains import current_gain_objects, learn_current_gains
     from pmsmtool.measurement.learn_gains import learn_speed_loop, learning_envelope
-    from pmsmtool.measurement.learn_position_gain import (
-        FORWARD,
-        POSITION,
-        forward_object,
-        learn_position_gain,
-        position_gain,
-    )
-    from pmsmtool.measurement.learned_rows import emf_of, learned_gains
+    from pmsmtool.measurement.learn_position_gain import FORWARD, POSITION, learn_position_gain, position_gain_objects
+    from pmsmtool.measurement.learned_rows import emf_of, learned_gains, winding_of
 
     asked = _addresses(names)
     file = load_machine_file(machine_path)
@@ -100,10 +95,7 @@ def learn_command(
         found = {}
         for name in (GAIN, INTEGRAL):
             found[name] = gain_object(node, name, *(asked.get(name) or gain_address(node, name)))
-        if POSITION in asked and (held := position_gain(node, asked[POSITION])) is not None:
-            found[POSITION] = held
-            if (forward := forward_object(node)) is not None:
-                found[FORWARD] = forward
+        found |= position_gain_objects(node, asked) | current_gain_objects(node, asked)
         envelope = learning_envelope(
             drive, file, motion.i_max_apk, motion.speed_max_rad_s, motion.shaft, motion.load, motion.brake
         )
@@ -111,7 +103,7 @@ def learn_command(
         lines = [
             *envelope.lines(),
             *unlike_stated(node),
-            "the shaft turns at up to 70 % of the speed limit and takes steps, with the drive's own speed loop",
+            "the shaft turns at up to 70 % of the speed limit, both ways; its own speed loop takes steps",
             *(["then its position loop moves it by three turns, 13 times at most"] if POSITION in found else []),
             *(f"{gain.name} in {gain.address} holds {gain.counts:.9g}: it is changed while the voltage is off, and "
               "restored" for gain in found.values()),
@@ -119,8 +111,10 @@ def learn_command(
         ]  # fmt: skip
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
         measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, emf_of(file), out.note)
-        results, stopped = learned_gains(file, measured), None
-        if POSITION in found:
+        results, loop = learned_gains(file, measured), measured.base[0].loop
+        of_currents, stopped = learn_current_gains(drive, found, envelope, loop, winding_of(file), out.note)
+        results |= of_currents
+        if POSITION in found and stopped is None:
             of_moves, stopped = learn_position_gain(connection, node, found[POSITION], envelope, out.note)
             results |= of_moves
         drive.close()
@@ -134,9 +128,10 @@ def _addresses(names: tuple[str, ...]) -> dict[str, tuple[int, int] | None]:
     """Return the wanted names with their objects, None where none is given."""
     from pmsmtool.errors import ConfigError
     from pmsmtool.measurement.changed_gains import STANDARD
+    from pmsmtool.measurement.learn_current_gains import CURRENT_GAIN, CURRENT_INTEGRAL
     from pmsmtool.measurement.learn_position_gain import POSITION
 
-    known = (*STANDARD, POSITION)
+    known = (*STANDARD, POSITION, CURRENT_GAIN, CURRENT_INTEGRAL)
     asked: dict[str, tuple[int, int] | None] = {}
     for text in names:
         name, mark, where = text.partition("=")

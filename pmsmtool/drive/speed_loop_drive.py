@@ -112,9 +112,15 @@ class SpeedLoopDrive(TorqueDrive):
         Whether the drive sends its samples by itself (process data); else they are asked for one by one.
     fastest_rad_s : float
         Speed by the samples at which :meth:`wait` raises ``LimitExceeded``; infinity: not watched.
+    starts : callable or None
+        Called once in a staircase, :attr:`starts_s` after its begin: starts the drive's own recorder.
     asked : tuple of DriveObject
         Where it shows the current that its speed loop asks for, and what flows, in one unit; empty: it does not.
     """
+
+    starts: Callable[[], None] | None = None
+    starts_s = 0.0
+    _began_s = 0.0
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)
@@ -214,6 +220,7 @@ class SpeedLoopDrive(TorqueDrive):
         """Note every sample from now on; a staircase is written step by step meanwhile."""
         began = self.node.connection.clock.now()
         self._samples, self._written, self._due = [], [], []
+        self._began_s = began
         self._unwrapped, self._behind_s = None, math.inf
         self.oscillation.begin()
         step = recording.excitation
@@ -245,7 +252,7 @@ class SpeedLoopDrive(TorqueDrive):
 
     def end_excitation(self) -> None:
         """Leave the speed where it is: the next command takes it back."""
-        self._recording, self._due = False, []
+        self._recording, self._due, self.starts = False, [], None
 
     def wait(self, seconds: float) -> None:
         """Let time pass; writes the steps that are due, and asks for samples where the drive does not send them."""
@@ -255,6 +262,9 @@ class SpeedLoopDrive(TorqueDrive):
             self.oscillation.check(f"node {self.node.node}")
             if self._watches:
                 self._check_speed()
+            if self.starts is not None and self._recording and clock.now() - self._began_s >= self.starts_s:
+                start, self.starts = self.starts, None
+                start()
             while self._due and self._due[0][0] - clock.now() < RESOLUTION_S:
                 speed = self._due.pop(0)[1]
                 if self._due and self._due[0][0] - clock.now() < RESOLUTION_S:

@@ -420,6 +420,8 @@ SIGNALS: dict[str, str] = {
     "torque_nm": "torque",
     "i_q_a": "current",
     "i_d_a": "current",
+    "i_q_ref_a": "current",
+    "asked_u_q": "ratio",
     "u_q_v": "voltage",
     "u_d_v": "voltage",
     "U_dc_v": "voltage",

@@ -15,6 +15,8 @@ from pmsmtool.drive_maps.wire_units import wire_unit
 
 TABLE = "recorder"
 PERIOD = "period"
+UNSCALED = "asked_u_q"
+"""Output of the q current loop in counts of unknown worth; ``u_q_v`` of the same variable says it in volts instead."""
 LARGEST_NUMBER = 0x7FFF
 RING_TYPES = ("UNSIGNED16", "INTEGER16")
 """One word each: how two words make a number is in no source read."""
@@ -134,7 +136,11 @@ def parse_recorder(
         if channel is None:
             continue
         place = (channel.number, channel.index, channel.sub)
-        if place in taken:
+        if name == UNSCALED and place in taken:
+            continue  # recorded in volts
+        if taken.get(place) == UNSCALED:
+            del channels[UNSCALED]
+        elif place in taken:
             tell("number" if channel.number else "index", f"is recorded as {taken[place]} already")
         taken[place] = name
         channels[name] = channel

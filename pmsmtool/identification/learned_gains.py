@@ -8,7 +8,7 @@ compared by their likelihood. A form, a scale or a convention that the data do n
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from pmsmtool.identification.asked_current import AskedLoop
@@ -64,7 +64,42 @@ BETTER = 0.95
 """Misfit of the current with the lag before the torque, over the one with it in the feedback, from which on it may lie
 there: 0.55 to 0.87 of three drives with current loops of 400 rad/s, 1.01 to 1.12 of four with 700 to 2200."""
 NO_DOUBT = (0.0, 0.0, 0.0)
+CURRENT_WIDEST = 0.03
+"""As :data:`WIDEST`, of a current loop."""
+CURRENT_MODEL_DOUBT, CURRENT_CHANGE_DOUBT = (0.005, 0.005), (0.015, 0.02, 0.015)
+"""As :data:`MODEL_DOUBT` and :data:`CHANGE_DOUBT`, of a current loop: counts of currents and voltage, dead time; see
+docs/learned-gains.md for what was measured."""
+CURRENT_UNITS = {"gain": "V/A", "value": "V/(A s)", "rate": "1/s", "time": "s"}
 UNITS = {"gain": "N m s/rad", "value": "N m/rad", "rate": "1/s", "time": "s"}
+
+
+@dataclass(frozen=True, slots=True)
+class Basis:
+    """What scales rest on: inertia or inductance, and what the model of the loop leaves (relative).
+
+    Attributes
+    ----------
+    value, std : float
+        SI value, and its standard deviation.
+    widest : float
+        Half width (95 %) of a scale beyond which it stays unknown.
+    model, change : tuple of float
+        Standard deviations of K_p and K_i, and of a ratio of two K_p, K_i or K_i / K_p.
+    units : dict of str to str
+        Of one count, by form; ``gain`` is K_p.
+    """
+
+    value: float
+    std: float
+    widest: float = WIDEST
+    model: tuple[float, float] = MODEL_DOUBT
+    change: tuple[float, float, float] = CHANGE_DOUBT
+    units: Mapping[str, str] = field(default_factory=lambda: UNITS)
+
+
+def current_basis(L_h: float, L_std: float) -> Basis:
+    """Return what the gains of a current loop rest on."""
+    return Basis(L_h, L_std, CURRENT_WIDEST, CURRENT_MODEL_DOUBT, CURRENT_CHANGE_DOUBT, CURRENT_UNITS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +121,11 @@ class Rotor:
     J_std: float
     time_constant_s: float
     f_s_hz: float
+
+    @property
+    def basis(self) -> Basis:
+        """What scales rest on."""
+        return Basis(self.J_kgm2, self.J_std)
 
     @property
     def lagging(self) -> float:
@@ -218,9 +258,9 @@ def _log(observation: Observation, which: int) -> float:
     return _logs(observation.loop)[which] + (0.0 if which == RATE else observation.held_back)
 
 
-def _change(after: Observation, base: Sequence[Observation], which: int) -> tuple[float, float]:
+def _change(after: Observation, base: Sequence[Observation], which: int, basis: Basis) -> tuple[float, float]:
     """Return the change of a gain's logarithm, and its standard deviation."""
-    return _log(after, which) - _log(base[0], which), CHANGE_DOUBT[which]
+    return _log(after, which) - _log(base[0], which), basis.change[which]
 
 
 def _of_all(logs: Sequence[float], half_size: float) -> tuple[float, float]:
@@ -235,7 +275,7 @@ def _mean(logs: Sequence[float]) -> tuple[float, float]:
     return mean, math.sqrt(sum((x - mean) ** 2 for x in logs) / max(1, len(logs) - 1))
 
 
-def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, rotor: Rotor, name: str) -> Learned:
+def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, basis: Basis, name: str) -> Learned:
     """Return what one count of the proportional gain is worth.
 
     Parameters
@@ -244,12 +284,12 @@ def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, ro
         With the drive's own gains: with steps of full size, and of half of it.
     gain_changed : Observation or None
         With other counts of the gain alone; None: it could not be changed.
-    rotor : Rotor
-        Its inertia.
+    basis : Basis
+        Inertia or inductance.
     """
     if gain_changed is None:
         return Learned(name, None, math.inf, None, "", "the gain was not changed")
-    change, std = _change(gain_changed, base, K_P)
+    change, std = _change(gain_changed, base, K_P, basis)
     asked = math.log(gain_changed.gain / base[0].gain)
     if abs(asked) < EXCLUDED * std:
         return Learned(name, None, math.inf, None, "", f"a change by {100 * std:.0f} % would not be seen")
@@ -258,27 +298,27 @@ def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, ro
         return Learned(name, None, math.inf, None, "", why)
     logs = [_log(o, K_P) - math.log(o.gain) for o in (base[0], gain_changed, base[1])]
     mean, std = _of_all(logs[:-1], logs[-1])
-    std = math.hypot(std, MODEL_DOUBT[0], base[0].std, base[0].model_std[K_P], rotor.J_std)
-    scale, half = rotor.J_kgm2 * math.exp(mean), NORMAL_95 * std
-    if half > WIDEST:
-        return Learned(name, None, half, "value", UNITS["gain"], f"its interval of {100 * half:.0f} % is too wide")
-    return Learned(name, scale, half, "value", UNITS["gain"])
+    std = math.hypot(std, basis.model[0], base[0].std, base[0].model_std[K_P], basis.std)
+    scale, half, unit = basis.value * math.exp(mean), NORMAL_95 * std, basis.units["gain"]
+    if half > basis.widest:
+        return Learned(name, None, half, "value", unit, f"its interval of {100 * half:.2g} % is too wide")
+    return Learned(name, scale, half, "value", unit)
 
 
 def integral_scale(
     base: Sequence[Observation],
     gain_changed: Observation | None,
     integral_changed: Sequence[Observation],
-    rotor: Rotor,
+    basis: Basis,
     name: str,
 ) -> Learned:
     """Return form and scale of the integral part; parameters as of :func:`gain_scale`."""
     if gain_changed is None or not integral_changed:
         return Learned(name, None, math.inf, None, "", "it was not changed")
-    by_gain, std_gain = _change(gain_changed, base, K_I)
+    by_gain, std_gain = _change(gain_changed, base, K_I, basis)
     ratio_gain = math.log(gain_changed.gain / base[0].gain)
     by_integral = [
-        (*_change(after, base, RATE), math.log(after.integral / base[0].integral)) for after in integral_changed
+        (*_change(after, base, RATE, basis), math.log(after.integral / base[0].integral)) for after in integral_changed
     ]
     chi_squares = {
         form: ((by_gain - of_gain * ratio_gain) / std_gain) ** 2
@@ -288,17 +328,17 @@ def integral_scale(
     best, second = sorted(chi_squares, key=lambda form: chi_squares[form])[:2]
 
     def unknown(why: str, form: str | None = None, half: float = math.inf) -> Learned:
-        return Learned(name, None, half, form, UNITS.get(form or "", ""), why, chi_squares)
+        return Learned(name, None, half, form, basis.units.get(form or "", ""), why, chi_squares)
 
     for after in integral_changed:
-        moved, std = _change(after, base, K_P)
+        moved, std = _change(after, base, K_P, basis)
         if abs(moved) > max(NOT_SAME * std, UNMOVED * abs(math.log(after.integral / base[0].integral))):
             return unknown(f"its change moved K_p by {100 * moved:.0f} %")
     if chi_squares[best] > FITS:
         return unknown("no form explains how the response follows both gains")
     if chi_squares[second] - chi_squares[best] < APART:
         return unknown(f"the forms {best!r} and {second!r} cannot be separated")
-    if best not in UNITS:
+    if best not in basis.units:
         return unknown(f"its form is {best!r}, which a drive map cannot describe")
     relative = best != "value"
     observed = (base[0], gain_changed, integral_changed[0], base[1])  # the smallest K_i is known least
@@ -308,11 +348,11 @@ def integral_scale(
         logs.append((-kept if best == "time" else kept) - math.log(o.integral))
     mean, std = _of_all(logs[:-1], logs[-1])
     model_std = base[0].model_std[RATE if relative else K_I]
-    half = NORMAL_95 * math.hypot(std, MODEL_DOUBT[1], base[0].std, model_std, 0.0 if relative else rotor.J_std)
-    if half > WIDEST:
-        return unknown(f"its interval of {100 * half:.0f} % is too wide", best, half)
-    scale = math.exp(mean) if relative else rotor.J_kgm2 * math.exp(mean)
-    return Learned(name, scale, half, best, UNITS[best], "", chi_squares)
+    half = NORMAL_95 * math.hypot(std, basis.model[1], base[0].std, model_std, 0.0 if relative else basis.std)
+    if half > basis.widest:
+        return unknown(f"its interval of {100 * half:.2g} % is too wide", best, half)
+    scale = math.exp(mean) if relative else basis.value * math.exp(mean)
+    return Learned(name, scale, half, best, basis.units[best], "", chi_squares)
 
 
 def convention(

@@ -8,7 +8,7 @@ learned last, with the drive's own counts, or with as many as are seen, from one
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from pmsmtool.bus.connection import Connection
@@ -56,6 +56,13 @@ def position_gain(node: DriveNode, address: tuple[int, int] | None = None) -> Ga
     """Return the object of the position gain, where its map names one without a unit or the caller does; else None."""
     where = address or _place(node, POSITION)
     return None if where is None else gain_object(node, POSITION, *where)
+
+
+def position_gain_objects(node: DriveNode, asked: Mapping[str, tuple[int, int] | None]) -> dict[str, GainObject]:
+    """Return the position gain where it is asked for, and the speed's feed-forward beside it; else none."""
+    gain = position_gain(node, asked[POSITION]) if POSITION in asked else None
+    forward = None if gain is None else forward_object(node)
+    return {one.name: one for one in (gain, forward) if one is not None}
 
 
 def _place(node: DriveNode, name: str) -> tuple[int, int] | None:

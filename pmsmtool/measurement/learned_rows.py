@@ -16,6 +16,7 @@ from pmsmtool.drive_maps.drive_map import LETTERS, Cell, DriveMap, Form
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map
 from pmsmtool.drive_maps.motion_objects import UNDECIDED
 from pmsmtool.drive_maps.wire_units import wire_unit
+from pmsmtool.identification.current_loop_response import Winding
 from pmsmtool.identification.learned_gains import (
     BANDWIDTH_DOUBT,
     Convention,
@@ -29,6 +30,7 @@ from pmsmtool.identification.speed_loop_response import Emf
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, GainObject
+from pmsmtool.measurement.learn_current_gains import CURRENT_GAIN, CURRENT_INTEGRAL
 from pmsmtool.measurement.learn_gains import LearnedLoop
 from pmsmtool.params.catalogue import EVERY
 
@@ -131,6 +133,8 @@ def with_measured(
 
 J_STD = 0.1
 """Standard deviation of an inertia without one (relative): a data sheet's is true to 20 %."""
+L_STD = 0.1
+"""Of an inductance without one (relative): no scale of a current gain is decided by it."""
 PSI_STD = 0.05
 """Of a flux linkage (relative), with what a magnet 40 K warmer loses."""
 READ_AS_RMS = math.sqrt(2.0)
@@ -157,13 +161,19 @@ def emf_of(file: MachineFile) -> Emf:
     return Emf(share, file.machine.R_s_ohm / file.machine.L_q_h, BANDWIDTH_DOUBT * share)
 
 
+def winding_of(file: MachineFile) -> Winding:
+    """Return what a current loop acts on."""
+    L = file.machine.L_q_h
+    return Winding(L, _relative(file, "L_q_h", L, L_STD), file.machine.R_s_ohm)
+
+
 def learned_gains(file: MachineFile, measured: LearnedLoop) -> dict[str, Learned]:
     """Return what was found of both gains, by catalogue name."""
     rotor = rotor_of(file)
     return {
-        GAIN: gain_scale(measured.base, measured.gain_changed, rotor, GAIN),
+        GAIN: gain_scale(measured.base, measured.gain_changed, rotor.basis, GAIN),
         INTEGRAL: integral_scale(
-            measured.base, measured.gain_changed, measured.integral_changed, rotor, INTEGRAL
+            measured.base, measured.gain_changed, measured.integral_changed, rotor.basis, INTEGRAL
         ),
     }  # fmt: skip
 
@@ -181,7 +191,9 @@ def shown_currents(file: MachineFile, measured: LearnedLoop, drive: SpeedLoopDri
 def measured_row(gain: GainObject, found: Learned) -> MeasuredRow:
     """Return the row of a map; the scale must be decided. A whole number may have a sign: half of its room is used."""
     assert found.scale is not None and found.form is not None
-    other = GAIN if found.form in ("rate", "time") else ""
+    other = ""
+    if found.form in ("rate", "time"):
+        other = CURRENT_GAIN if gain.name == CURRENT_INTEGRAL else GAIN
     letter = gain.item.letter
     signed = letter.lower() if gain.counts < 1 << 8 * gain.item.size - 1 else letter
     return MeasuredRow(

@@ -53,9 +53,9 @@ def observed(form: str, half_size: float = 0.0) -> tuple[list[Observation], Obse
 )  # fmt: skip
 def test_each_form_is_told_apart(form: str, unit: str, scale: float) -> None:
     base, gain_changed, integral_changed = observed(form)
-    gain = gain_scale(base, gain_changed, ROTOR, P)
+    gain = gain_scale(base, gain_changed, ROTOR.basis, P)
     assert gain.scale == pytest.approx(COUNT, rel=1e-3) and gain.half_width < 0.12
-    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    found = integral_scale(base, gain_changed, integral_changed, ROTOR.basis, I)
     assert (found.form, found.unit) == (form, unit) and found.scale == pytest.approx(scale, rel=3e-3)
     assert min(found.chi_squares, key=lambda name: found.chi_squares[name]) == form
 
@@ -63,38 +63,38 @@ def test_each_form_is_told_apart(form: str, unit: str, scale: float) -> None:
 def test_what_is_not_told_apart_stays_unknown() -> None:
     base, _, integral_changed = observed("value")
     between = Observation(1400, INTEGRALS, loop(0.7 * A0, math.sqrt(0.7) * A0 * RATE))
-    found = integral_scale(base, between, integral_changed, ROTOR, I)
+    found = integral_scale(base, between, integral_changed, ROTOR.basis, I)
     assert found.scale is None and "cannot be separated" in found.why
 
 
 def test_steps_of_two_sizes_say_what_friction_leaves() -> None:
     base, gain_changed, integral_changed = observed("rate", half_size=-0.04)
-    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    found = integral_scale(base, gain_changed, integral_changed, ROTOR.basis, I)
     assert found.scale == pytest.approx(RATE / INTEGRALS)
     base, gain_changed, integral_changed = observed("rate", half_size=-0.15)
-    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    found = integral_scale(base, gain_changed, integral_changed, ROTOR.basis, I)
     assert found.scale is None and "too wide" in found.why
 
 
 def test_an_object_without_effect_is_named() -> None:
     base, gain_changed, integral_changed = observed("none")
-    found = integral_scale(base, gain_changed, integral_changed, ROTOR, I)
+    found = integral_scale(base, gain_changed, integral_changed, ROTOR.basis, I)
     assert found.scale is None and found.form is None and "no effect" in found.why
 
 
 def test_a_response_that_does_not_follow_the_counts_decides_nothing() -> None:
     base, gain_changed, _ = observed("value")
     half = Observation(1400, INTEGRALS, loop(A0 * math.sqrt(0.7), A0 * RATE))
-    assert "exponent 0.50" in gain_scale(base, half, ROTOR, P).why
-    assert gain_scale(base, None, ROTOR, P).scale is None
-    wide = gain_scale(base, gain_changed, Rotor(J, 0.1, 1.0, F_S), P)
+    assert "exponent 0.50" in gain_scale(base, half, ROTOR.basis, P).why
+    assert gain_scale(base, None, ROTOR.basis, P).scale is None
+    wide = gain_scale(base, gain_changed, Rotor(J, 0.1, 1.0, F_S).basis, P)
     assert wide.scale is None and "too wide" in wide.why
 
 
 def test_an_integral_that_moves_the_gain_too_is_not_one() -> None:
     base, gain_changed, _ = observed("value")
     both = Observation(COUNTS, 400, loop(0.8 * A0, 0.8 * A0 * RATE))
-    assert "moved K_p" in integral_scale(base, gain_changed, [both], ROTOR, I).why
+    assert "moved K_p" in integral_scale(base, gain_changed, [both], ROTOR.basis, I).why
 
 
 @pytest.mark.parametrize(("kind", "ratio"), [("peak", 1.0), ("rms", math.sqrt(2.0)), ("block", 1.1027)])
@@ -122,8 +122,8 @@ def test_what_the_emf_may_take_is_in_the_interval_that_it_moves() -> None:
     assert moved == pytest.approx((0.074, 0.074, 0.0), abs=1e-3)
     assert emf_doubt(*ends, 0.05) == pytest.approx((0.05, 0.05, 0.0))
     light = [replace(base[0], model_std=moved), *base[1:]]
-    assert gain_scale(light, gain_changed, ROTOR, P).scale is None
-    assert integral_scale(light, gain_changed, integral_changed, ROTOR, I).scale == pytest.approx(
+    assert gain_scale(light, gain_changed, ROTOR.basis, P).scale is None
+    assert integral_scale(light, gain_changed, integral_changed, ROTOR.basis, I).scale == pytest.approx(
         1.0 / RATE / INTEGRALS, rel=3e-3
     )
 
@@ -134,14 +134,15 @@ def test_a_lag_that_may_lie_before_the_torque_is_in_the_interval() -> None:
     own, forward = replace(base[0].loop, misfit=7.5), loop(1.2 * A0, 1.2 * A0 * RATE)
     doubt = lag_doubt(own, replace(forward, misfit=5.5))
     assert doubt == pytest.approx((0.5 * math.log(1.2), 0.5 * math.log(1.2), 0.0), abs=1e-3)
-    assert gain_scale([replace(base[0], model_std=doubt), *base[1:]], gain_changed, ROTOR, P).scale is None
+    assert gain_scale([replace(base[0], model_std=doubt), *base[1:]], gain_changed, ROTOR.basis, P).scale is None
     assert lag_doubt(own, replace(forward, misfit=7.4)) == (0.0, 0.0, 0.0), "a fast current loop explains as much"
 
 
 def test_a_small_current_leaves_gains_unknown() -> None:
     base, gain_changed, _ = observed("value")
     small = [replace(base[0], current_share=0.07), *base[1:]]
-    assert gain_scale(base, gain_changed, ROTOR, P).scale and gain_scale(small, gain_changed, ROTOR, P).scale is None
+    assert gain_scale(base, gain_changed, ROTOR.basis, P).scale
+    assert gain_scale(small, gain_changed, ROTOR.basis, P).scale is None
 
 
 def test_what_does_not_flow_at_once_is_added_and_half_of_it_doubted() -> None:
@@ -152,9 +153,9 @@ def test_what_does_not_flow_at_once_is_added_and_half_of_it_doubted() -> None:
         return [replace(one, current_share=0.1, at_once=at_once) for one in (*base, gain_changed, *integral_changed)]
 
     own, half, less, *changed = shown(0.84)
-    gain = gain_scale([own, half], less, ROTOR, P)
+    gain = gain_scale([own, half], less, ROTOR.basis, P)
     assert gain.scale == pytest.approx(COUNT * math.exp(0.048), rel=1e-3) and gain.half_width < 0.1
-    found = integral_scale([own, half], less, changed, ROTOR, I)
+    found = integral_scale([own, half], less, changed, ROTOR.basis, I)
     assert found.scale == pytest.approx(J * A0 * RATE / INTEGRALS * math.exp(0.048), rel=3e-3)
     own, half, less, *_ = shown(0.40)
-    assert gain_scale([own, half], less, ROTOR, P).scale is None
+    assert gain_scale([own, half], less, ROTOR.basis, P).scale is None

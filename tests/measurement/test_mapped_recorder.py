@@ -77,7 +77,7 @@ def opened(folder: Path, text: str, family: str = "") -> Iterator[tuple[Connecti
 def test_a_completed_map_lifts_a_copley_to_the_level_of_recorders(tmp_path: Path) -> None:
     with opened(tmp_path, completed()) as (connection, found):
         assert found.level is CapabilityLevel.RECORDER
-        assert found.recorder.startswith("trace of i_d_a, i_q_a, U_dc_v, u_d_v")
+        assert found.recorder.startswith("trace of i_d_a, i_q_a, i_q_ref_a, U_dc_v, u_d_v")
         row = found.row("R", Method.RECORDER)
         assert row.available and not row.expected  # what was measured was the reference drive's recorder
         drive = open_for_level(connection, 1, found)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from pmsmtool.cia402 import Mode
 from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.dictionary import Dictionary, Entry
+from pmsmtool.sim.node.drive_core import RecorderSetup
 from pmsmtool.sim.node.power_drive import Plant, PowerDrive
 
 if TYPE_CHECKING:
@@ -138,6 +139,8 @@ class Behind:
     largest_step: float = 0.0
     velocity_ff: float = 0.0
     position_gains: PositionGains = field(init=False)
+    _turns_off: int = field(default=0, init=False)
+    _before_record: float | None = field(default=None, init=False)
     _torque_nm: float = field(default=0.0, init=False)
     _slope: float = field(default=0.0, init=False)
 
@@ -158,7 +161,18 @@ class Behind:
     def position(self, units_per_turn: float) -> float:
         """Return the angle in units, as a counter of 32 bits."""
         half = 1 << POSITION_BITS - 1
-        return (round(self._signal(Signal.THETA_M) / (2.0 * math.pi) * units_per_turn) + half) % (2 * half) - half
+        return (round(self._shaft_turns() * units_per_turn) + half) % (2 * half) - half
+
+    def _shaft_turns(self) -> float:
+        seen = self._signal(Signal.THETA_M) / (2.0 * math.pi)
+        if self._before_record is not None:  # the shaft has turned by less than half a turn since
+            self._turns_off, self._before_record = round(self._before_record - seen), None
+        return seen + self._turns_off
+
+    def record(self, setup: RecorderSetup) -> None:
+        """Start the recorder of the core; it takes whole turns off the angle, which no counter of a drive forgets."""
+        self._before_record = self._shaft_turns()
+        self.plant.core.record(setup)
 
     def turns_per_s(self) -> float:
         """Return the mechanical speed."""

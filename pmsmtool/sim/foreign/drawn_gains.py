@@ -16,6 +16,8 @@ from typing import Literal
 from pmsmtool.sim.foreign.behind import Behind, SetUp
 from pmsmtool.sim.foreign.families import Law
 from pmsmtool.sim.foreign.file_rows import MakersObjects
+from pmsmtool.sim.foreign.trace import MARKS as TRACE_MARKS
+from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 
 Form = Literal["parallel", "rate", "time"]
 Address = tuple[int, int]
@@ -33,6 +35,10 @@ POSITION_OBJECTS: tuple[tuple[Address, Address | None], ...] = (
     ((0x60FB, 1), (0x60FB, 2)),
 )
 """Position gain and feed-forward of the speed: Nanotec, ZeroErr, Copley; a controller of the position has neither."""
+CURRENT_OBJECTS: tuple[Address, Address] = ((0x60F6, 1), (0x60F6, 2))
+"""Proportional and integral part of the current loops, of drives whose trace shows them at loop rate: Copley."""
+CURRENT_INTEGRAL_RATE = (0.5, 1.5)
+"""Integral rate of a current loop, over R / L."""
 SOURCE = "drawn by a seed"
 BANDWIDTH_RAD_S = (25.0, 140.0)
 INTEGRAL_RATE = (0.08, 0.35)
@@ -87,6 +93,8 @@ class DrawnGains:
         What they hold at first.
     K_v_per_s, forward_share : float
         One count of either.
+    current : DrawnGains or None
+        Of the current loops, where the drive has objects of them and a trace: V/A, and V/(A s), 1/s or s.
     """
 
     gain: Address
@@ -105,6 +113,7 @@ class DrawnGains:
     forward_counts: int = 0
     K_v_per_s: float = 0.0
     forward_share: float = 0.0
+    current: DrawnGains | None = None
 
     def K_i_nm_per_rad(self, gain: float, integral: float) -> float:
         """Return the integral gain that counts of both objects mean."""
@@ -118,20 +127,14 @@ class DrawnGains:
 
     def laws(self, laws: Mapping[Address, Law]) -> Iterator[Law]:
         """Yield the laws of both gains, and those of the currents as drawn."""
-        held = list(map(float, self.counts))
 
-        def taking(position: int) -> Callable[[Behind, float], None]:
-            def act(behind: Behind, counts: float) -> None:
-                new = [*held[:position], counts, *held[position + 1 :]]
-                K_p, K_i = self.K_p_nms_per_rad * new[0], self.K_i_nm_per_rad(*new)
-                behind.set_speed_gains(K_p, K_i)  # refuses what it cannot take
-                held[:] = new
-                behind.position_gains.K_p, behind.position_gains.K_i = K_p, K_i
+        def set_speed_gains(behind: Behind, K_p: float, K_i: float) -> None:
+            behind.set_speed_gains(K_p, K_i)  # refuses what it cannot take
+            behind.position_gains.K_p, behind.position_gains.K_i = K_p, K_i
 
-            return act
-
-        for position, address in enumerate((self.gain, self.integral)):
-            yield Law(*address, SOURCE, set_up=self.counts[position], act=taking(position))
+        yield from self._loop(set_speed_gains)
+        if self.current is not None:
+            yield from self.current._loop(Behind.set_gains)
         if self.position is not None:
             yield Law(*self.position, SOURCE, set_up=self.position_counts, act=self._act_on_position)
         if self.forward is not None:
@@ -143,6 +146,21 @@ class DrawnGains:
         for address, stated in {**CURRENTS, **own}.items():
             if address in laws:
                 yield _scaled(laws[address], kind / stated)
+
+    def _loop(self, take: Callable[[Behind, float, float], None]) -> Iterator[Law]:
+        """Yield the laws of one loop's gains; ``take`` gets both in SI."""
+        held = list(map(float, self.counts))
+
+        def taking(position: int) -> Callable[[Behind, float], None]:
+            def act(behind: Behind, counts: float) -> None:
+                new = [*held[:position], counts, *held[position + 1 :]]
+                take(behind, self.K_p_nms_per_rad * new[0], self.K_i_nm_per_rad(*new))
+                held[:] = new
+
+            return act
+
+        for position, address in enumerate((self.gain, self.integral)):
+            yield Law(*address, SOURCE, set_up=self.counts[position], act=taking(position))
 
     def _act_on_position(self, behind: Behind, counts: float) -> None:
         behind.position_gains.K_v = self.K_v_per_s * counts
@@ -180,7 +198,23 @@ def draw_gains(seed: int, objects: MakersObjects, motor: SetUp) -> DrawnGains | 
         *found, (counts[0], counts[1]), K_p / counts[0], kept / counts[1], form, chance.random() < 0.5,
         _between(chance, *FILTER_HZ), chance.randint(*DECIMATION), _between(chance, *CURRENT_BANDWIDTH),
     )  # fmt: skip
-    return _with_position(drawn, bandwidth, chance, objects)
+    return _with_current(_with_position(drawn, bandwidth, chance, objects), chance, objects, motor)
+
+
+def _with_current(drawn: DrawnGains, chance: random.Random, objects: MakersObjects, motor: SetUp) -> DrawnGains:
+    """Return the draw with gains of the current loops, where the file has a trace that shows what they do."""
+    if not objects.has(*CURRENT_OBJECTS, *TRACE_MARKS):
+        return drawn
+    K_p = motor.K_p_v_per_a * drawn.current_bandwidth / SET_UP_BANDWIDTH
+    rate = motor.R_s_ohm / motor.L_q_h * _between(chance, *CURRENT_INTEGRAL_RATE)
+    form: Form = chance.choice(("parallel", "rate", "time"))
+    gain, integral = (round(_between(chance, *_room(objects, address))) for address in CURRENT_OBJECTS)
+    kept = {"parallel": K_p * rate, "rate": rate, "time": 1.0 / rate}[form]
+    current = replace(
+        drawn, gain=CURRENT_OBJECTS[0], integral=CURRENT_OBJECTS[1], counts=(gain, integral),
+        K_p_nms_per_rad=K_p / gain, integral_scale=kept / integral, form=form,
+    )  # fmt: skip
+    return replace(drawn, current=current)
 
 
 def _with_position(drawn: DrawnGains, bandwidth: float, chance: random.Random, objects: MakersObjects) -> DrawnGains:

@@ -31,6 +31,8 @@ from pmsmtool.sim.foreign.families import (
 )
 from pmsmtool.sim.foreign.file_rows import MAPPINGS, MakersObjects, read_makers_objects
 from pmsmtool.sim.foreign.position import PositionLoop
+from pmsmtool.sim.foreign.trace import MARKS as TRACE_MARKS
+from pmsmtool.sim.foreign.trace import RowTrace
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.node.node import VENDOR
@@ -174,8 +176,11 @@ class ForeignDrive:
             _obey(law, dictionary.find(law.index, law.sub), behind)
         if self.gains is not None:
             behind.sample_speed(self.gains.filter_hz, self.gains.decimation)
-            behind.speed_current_loops(self.gains.current_bandwidth / SET_UP_BANDWIDTH)
+            if self.gains.current is None:  # else its own counts have set them
+                behind.speed_current_loops(self.gains.current_bandwidth / SET_UP_BANDWIDTH)
         self._hook_modes(dictionary, behind)
+        if self.objects.has(*TRACE_MARKS):
+            RowTrace(self.objects, dictionary, behind)
         if any(mode in POSITION_MODES for mode in modes_of(self.objects)):
             per_turn, per_rps, _ = units_of(self.objects, self.set_up)
             period_s = family_of(self.objects).loop_s

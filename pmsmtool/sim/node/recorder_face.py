@@ -24,6 +24,8 @@ SIGNALS = {
     "torque_nm": Signal.TAU,
     "i_q_a": Signal.I_Q,
     "i_d_a": Signal.I_D,
+    "i_q_ref_a": Signal.I_Q_REF,
+    "asked_u_q": Signal.U_Q,
     "u_q_v": Signal.U_Q,
     "u_d_v": Signal.U_D,
     "U_dc_v": Signal.U_DC,
