@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     "caps",
     epilog=examples(
         "pmsmtool --sim interior-2k2 caps",
-        "pmsmtool -i pmsmsim -c 'interior-2k2?drive=epos4' caps",
         "pmsmtool -i socketcan -c can0 -n 5 caps --map my-drive.toml --json",
         "pmsmtool caps --eds maker.eds",
         "pmsmtool caps motor.toml --eds maker.eds",
