@@ -117,7 +117,7 @@ def test_a_drive_that_gives_a_tenth_of_its_current_is_no_wrong_wiring(tool: Tool
     assert "10 % of its rated current (0x6072)" in said, said
     code, printed, said = tool("check", str(machine_path("interior-2k2")), *drive, "--i-max", "0.1Apk", "--json")
     (row,) = (row for row in json.loads(printed)["findings"] if row["looked_at"] == "shaft")
-    assert code == 10 and row["verdict"] == "not seen" and "0.82 % of the rated current" in row["shown"], row
+    assert code == 10 and row["verdict"] == "not seen" and "0.82 % of the motor's rated current" in row["shown"], row
 
 
 MOVE: tuple[Row, ...] = ((0x607A, 0, "I32", "rw", "0"), (0x60F4, 0, "I32", "ro", ""))
