@@ -152,9 +152,9 @@ def refusal(stage: Stage, run: RunDirectory) -> Contradiction | None:
     if not wrong:
         return None
     names = [str(row["name"]) for row in wrong]
-    hint = f"correct {', '.join(_KEYS.get(name, name) for name in names)} in the machine file and begin a new run"
-    if not stage.values:
-        hint = hint.replace("machine file", "machine file, or set the drive up for this motor,")
+    set_up = "" if stage.values else ", or set the drive up for this motor,"
+    keys = ", ".join(_KEYS.get(name, name) for name in names)
+    hint = f"correct {keys} in the machine file{set_up} and begin a new run"
     if any(row["source"] != DATA_SHEET for row in wrong):
         hint = "give a machine file of this motor (`pmsmtool machine new` writes one) and begin a new run"
     elif all(name in ACCEPTABLE for name in names):

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import TypeVar
 
 from pmsmtool.drive.drive_node import NOT_READ, DriveNode
 from pmsmtool.drive.envelope import Envelope
@@ -19,7 +20,7 @@ from pmsmtool.drive.guard import GuardedDrive, guarded
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.drive_map import LETTERS
-from pmsmtool.errors import NotAvailable, PmsmtoolError, SafetyRefusal, SdoAbort
+from pmsmtool.errors import IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal, SdoAbort
 from pmsmtool.flash.gain_journal import GainJournal
 from pmsmtool.flash.journal import Entry
 
@@ -54,6 +55,7 @@ class GainObject:
 
 Put = Callable[[GainObject, float], None]
 """Stops the drive, notes counts of a gain in the journal, and writes them."""
+Seen = TypeVar("Seen")
 
 
 def gain_address(node: DriveNode, name: str) -> tuple[int, int]:
@@ -132,6 +134,40 @@ def changed_counts(gain: GainObject, ratio: float) -> float:
             f"{gain.name} holds {gain.counts:.9g}: it cannot be changed by {ratio:g}", where=gain.address
         )
     return counts
+
+
+def while_changed(
+    gain: GainObject,
+    ratio: float,
+    guard: GuardedDrive,
+    put: Put,
+    notes: list[str],
+    observe: Callable[[str, float], Seen],
+) -> Seen | None:
+    """Change one gain while the voltage is off, observe, and bring it back; None, and why in ``notes``, where not.
+
+    ``observe`` takes a name for what it observes, and the counts of the gain.
+    """
+    try:
+        new = changed_counts(gain, ratio)
+    except NotAvailable as error:
+        notes.append(f"{gain.name}: {error.what}")
+        return None
+    try:
+        put(gain, new)
+    except SdoAbort as abort:
+        notes.append(f"{gain.name}: the drive does not take {new:.9g}: {abort.what}")
+        guard.enable()
+        return None
+    guard.enable()
+    found = None
+    try:
+        found = observe(f"{gain.address} {gain.counts:.9g} -> {new:.9g}", new)
+    except IdentificationError as error:
+        notes.append(f"{gain.name}: {error.what}")
+    put(gain, gain.counts)  # after anything else the guard does it, and nothing is enabled again
+    guard.enable()
+    return found
 
 
 def refuse_unsafe(node: DriveNode, envelope: Envelope) -> None:

@@ -37,11 +37,11 @@ from pmsmtool.measurement.changed_gains import (
     DOWN,
     GainObject,
     Put,
-    changed_counts,
     changing,
     gain_object,
     named_addresses,
     refuse_unsafe,
+    while_changed,
 )
 from pmsmtool.measurement.learn_gains import (
     HIGH_SHARE,
@@ -266,11 +266,6 @@ class _CurrentLearner:
         self, gain: GainObject, ratio: float, own: CurrentLoop, worst: tuple[float, float], counts: dict[str, float]
     ) -> Observation | None:
         """Change one gain while the voltage is off, measure, and bring it back; None where it must not be changed."""
-        try:
-            new = changed_counts(gain, ratio)
-        except NotAvailable as error:
-            self.notes.append(f"{gain.name}: {error.what}")
-            return None
         lag_s = (own.delay + PLANT_PERIODS) * self.period_s
         margin = min(
             phase_margin_rad(own.K_p_per_L * p, own.K_p_per_L * own.rate_per_s * i, lag_s)
@@ -284,20 +279,7 @@ class _CurrentLearner:
                 "current loop would be little faster than the speed loop"
             )
             return None
-        try:
-            self.put(gain, new)
-        except SdoAbort as abort:
-            self.notes.append(f"{gain.name}: the drive does not take {new:.9g}: {abort.what}")
-            self.guard.enable()
-            return None
-        self.guard.enable()
-        found = None
-        try:
-            found, _ = self._observe(
-                f"{gain.address} {gain.counts:.9g} -> {new:.9g}", 1.0, {**counts, gain.name: new}, own
-            )
-        except IdentificationError as error:
-            self.notes.append(f"{gain.name}: {error.what}")
-        self.put(gain, gain.counts)  # after anything else the guard does it, and nothing is enabled again
-        self.guard.enable()
-        return found
+        return while_changed(
+            gain, ratio, self.guard, self.put, self.notes,
+            lambda what, new: self._observe(what, 1.0, {**counts, gain.name: new}, own)[0],
+        )  # fmt: skip

@@ -15,7 +15,7 @@ from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive
 from pmsmtool.drive.motion_objects import limits_speed
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
-from pmsmtool.errors import IdentificationError, NotAvailable, SafetyRefusal, SdoAbort
+from pmsmtool.errors import IdentificationError, SafetyRefusal
 from pmsmtool.identification.asked_current import asked_share, fit_asked_current, shows_asked
 from pmsmtool.identification.learned_gains import NO_DOUBT, Observation, emf_doubt, lag_doubt
 from pmsmtool.identification.speed_loop_response import (
@@ -34,9 +34,9 @@ from pmsmtool.measurement.changed_gains import (
     INTEGRAL,
     GainObject,
     Put,
-    changed_counts,
     changing,
     refuse_unsafe,
+    while_changed,
 )
 from pmsmtool.measurement.speed_unit import find_speed_unit
 from pmsmtool.trace import Trace
@@ -441,11 +441,6 @@ class _Learner:
                 f"{gain.name}: not changed, for the fit of the response ended at the bound of {TIMES[time]}"
             )
             return None
-        try:
-            new = changed_counts(gain, ratio)
-        except NotAvailable as error:
-            self.notes.append(f"{gain.name}: {error.what}")
-            return None
         margin = _margin(own, worst)
         least = LEAST_MARGIN_RAD if max(worst) > 1.0 else LEAST_MARGIN_DOWN_RAD
         if margin < least:
@@ -454,19 +449,7 @@ class _Learner:
                 f"{math.degrees(least):.0f}"
             )
             return None
-        try:
-            self.put(gain, new)
-        except SdoAbort as abort:
-            self.notes.append(f"{gain.name}: the drive does not take {new:.9g}: {abort.what}")
-            self.guard.enable()
-            return None
-        self.guard.enable()
-        found = None
-        try:
-            what = f"{gain.address} {gain.counts:.9g} -> {new:.9g}"
-            found = self._observe(what, step, {**counts, gain.name: new}, own.loop, own.loop.lag_s)
-        except IdentificationError as error:
-            self.notes.append(f"{gain.name}: {error.what}")
-        self.put(gain, gain.counts)  # after anything else the guard does it, and nothing is enabled again
-        self.guard.enable()
-        return found
+        return while_changed(
+            gain, ratio, self.guard, self.put, self.notes,
+            lambda what, new: self._observe(what, step, {**counts, gain.name: new}, own.loop, own.loop.lag_s),
+        )  # fmt: skip
