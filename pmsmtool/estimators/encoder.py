@@ -15,7 +15,7 @@ import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS, Harmonic
-from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.parameters import MAX_POLE_PAIRS, Estimate
 from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
@@ -33,8 +33,6 @@ deviations of 30 to 70 deg the mean of both directions was 0.0 to 2.4 deg off on
 (a load of 190 times the rotor swung by 124 deg: its pole pairs, psi and L came out all the same)."""
 COUNTS_SHARE = 0.25
 """Part of the imposed angle that friction leaves a rotor; less is none."""
-MAX_POLE_PAIRS = 64
-"""Pole pairs up to which a turning rotor is told from a standing one."""
 PER_TURN_LEAST_RAD = 2e-3
 PER_TURN_ORDERS = 8
 """Highest order per turn that shows how much of the following error is no encoder's."""

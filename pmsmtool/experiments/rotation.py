@@ -28,6 +28,7 @@ import numpy as np
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError
 from pmsmtool.experiments.signals import table
+from pmsmtool.machine.parameters import MAX_POLE_PAIRS
 from pmsmtool.trace import Trace
 from pmsmtool.units import RPM_PER_RAD_S
 
@@ -167,9 +168,6 @@ def lead_onto_vector(drive: Drive, i_a: float, angle_rad: float) -> None:
         drive.command_current(i_a * FIRST_SHARE ** (1.0 - risen), 0.0, fixed_angle_rad=angle_rad - off)
         drive.wait(LEAD_STEP_S)
 
-
-MAX_POLE_PAIRS = 32
-"""A machine with more is not found by turning its vector; the run ends with E_POLE_PAIRS."""
 
 BACK_AT_MOST = 1.15
 """Steps of the way back, of those of the way there: a rotor that lags or sticks at a turning point needs more."""

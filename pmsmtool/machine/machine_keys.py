@@ -8,6 +8,7 @@ import re
 from dataclasses import replace
 
 from pmsmtool.machine.key import Key, KeyKind, Value
+from pmsmtool.machine.parameters import MAX_POLE_PAIRS
 from pmsmtool.machine.simulation_keys import SIMULATION_KEYS
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K
 
@@ -35,7 +36,7 @@ def _text(table: str, name: str, meaning: str) -> Key:
 _PI2 = 2.0 * math.pi
 
 MACHINE_KEYS: tuple[Key, ...] = (
-    _key("machine", "pole_pairs", "1", 1, 64, None, "pole pairs", kind="int", required=True),
+    _key("machine", "pole_pairs", "1", 1, MAX_POLE_PAIRS, None, "pole pairs", kind="int", required=True),
     _key("machine", "R_s_ohm", "ohm", 1e-5, 1e3, None, "loop resistance per phase at T_ref", required=True),
     _key("machine", "L_d_h", "H", 1e-7, 10, None, "incremental d inductance", required=True),
     _key("machine", "L_q_h", "H", 1e-7, 10, None, "incremental q inductance", required=True),

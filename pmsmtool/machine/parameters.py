@@ -21,6 +21,8 @@ Shaft = Literal["free", "locked", "coupled"]
 Load = Literal["none", "gravity"]
 Brake = Literal["open", "drive", "none"]
 
+MAX_POLE_PAIRS = 64
+"""Of a machine file, of a drive's object, and of what a slow turn finds: a closed-loop stepper motor has 50."""
 RUN_UP_S = (3e-4, 60.0)
 """Time (s) to rated speed at rated torque of rotors and loads in use."""
 LARGEST_OWN_FLUX = 10.0

@@ -11,7 +11,7 @@ import math
 
 from pmsmtool.machine.hall import HALL_ORDERS
 from pmsmtool.machine.key import Key, Value
-from pmsmtool.machine.parameters import MachineParameters
+from pmsmtool.machine.parameters import MAX_POLE_PAIRS, MachineParameters
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import format_quantity
 
@@ -150,7 +150,7 @@ SIMULATION_KEYS: tuple[Key, ...] = (
     _number(
         "alpha_psi_per_k", "1/K", -0.01, 0.001, None, "true coefficient of the magnets", "[machine] alpha_psi_per_k"
     ),
-    _whole("pole_pairs", 1, 64, None, "true pole pairs", "[machine] pole_pairs"),
+    _whole("pole_pairs", 1, MAX_POLE_PAIRS, None, "true pole pairs", "[machine] pole_pairs"),
     _number("iron_loss_ohm", "ohm", 0, 1e6, 0.0, "iron-loss resistance in parallel with the flux voltage, 0 none"),
     _number("eddy_share", "1", 0, 0.9, 0.0, "share of the inductances that fast changes do not see"),
     _number("eddy_time_s", "s", 1e-6, 1, 1e-3, "time constant of that share"),

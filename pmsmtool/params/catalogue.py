@@ -17,6 +17,7 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
+from pmsmtool.machine.parameters import MAX_POLE_PAIRS
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K
 
 SCHEMA_VERSION = 1
@@ -98,7 +99,7 @@ CATALOGUE: tuple[Parameter, ...] = (
     # motor data (defaults: Jercic et al. 2017, Table 1)
     *_object(
         0x2010, "motor",
-        ("pole_pairs", _U8, "1", 4, 1, 64, "pole pairs"),
+        ("pole_pairs", _U8, "1", 4, 1, MAX_POLE_PAIRS, "pole pairs"),
         ("R_s_ohm", _F32, "ohm", 0.137, 1e-5, 1e3, "loop resistance per phase at T_ref"),
         ("L_d_h", _F32, "H", 0.0023, 1e-7, 10, "incremental d inductance"),
         ("L_q_h", _F32, "H", 0.0021, 1e-7, 10, "incremental q inductance"),

@@ -26,6 +26,7 @@ from pmsmtool.experiments.rotation import (
     step_within,
     turn_vector,
 )
+from pmsmtool.machine.parameters import MAX_POLE_PAIRS
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import ROTATIONS, Measurement
 from pmsmtool.trace import Trace
@@ -100,6 +101,13 @@ def test_a_rotor_that_swings_stays_on_the_first_vector(swing_rad_s: float, rippl
     found = estimate_encoder(*runs)
     assert found.pole_pairs.value == POLE_PAIRS
     assert abs(found.offset.value) < math.radians(1.0)
+
+
+def test_as_many_pole_pairs_as_a_machine_file_states_are_turned_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stepper motor of 50 ended its turn after 0.65 of it, and with it L, psi and the mechanics."""
+    monkeypatch.setitem(globals(), "POLE_PAIRS", MAX_POLE_PAIRS)
+    found = estimate_encoder(*rotate_vector(SwingingRotor(60.0, 0.03), first_plan()))  # type: ignore[arg-type]
+    assert found.pole_pairs.value == MAX_POLE_PAIRS
 
 
 def test_the_rotor_rests_on_a_whole_turn_afterwards() -> None:
