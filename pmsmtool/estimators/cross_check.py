@@ -68,9 +68,8 @@ class CrossCheck:
     @property
     def verdict(self) -> str:
         """What a person reads."""
-        word = "agrees with" if self.agrees else "DISAGREES with"
-        if self.agrees and self.half_width > JUDGES:
-            word = "too uncertain to judge"
+        agrees = "agrees with" if self.half_width <= JUDGES else "too uncertain to judge"
+        word = agrees if self.agrees else "DISAGREES with"
         return (
             f"{word} {self.of}: {100.0 * self.difference:+.2g} % off, interval of that {100.0 * self.half_width:.3g} %"
         )
@@ -89,7 +88,8 @@ def cross_check(name: str, of: str, second: Estimate, first: Estimate, common_st
         Relative standard deviation that both have from the same cause.
     """
     own = [max(0.0, (e.std / e.value) ** 2 - common_std**2) for e in (second, first)]
-    return CrossCheck(name, of, second, second.value / first.value - 1.0, COVERAGE_FACTOR * math.sqrt(sum(own)))
+    ratio = second.value / first.value
+    return CrossCheck(name, of, second, ratio - 1.0, COVERAGE_FACTOR * abs(ratio) * math.sqrt(sum(own)))
 
 
 def driven_flux_linkage(

@@ -347,6 +347,14 @@ def test_an_L_q_that_misses_its_shots_and_the_speeds_is_no_narrow_value(
     assert ("shows 2.8 mH" in beside.fallback) == widened and beside.value == L_q.value
 
 
+def test_run_over_speeds_that_hardly_shows_L_q_takes_no_good_one_along() -> None:
+    """A motor of 2 kN m: 0.445 mH at +-1.5 %, 0.80 +- 0.35 mH at speed. L_q became +-160 %, and was refused."""
+    L_q = Estimate(0.445e-3, 3.3e-6, 6.3e-6, "H", chi2=7.9)
+    found = InductanceResult(L_q, L_q, {}, 0.0, 0.0, (), 0.0, Verdict.WARN)
+    beside = _beside_speeds(found, Estimate(0.801e-3, 0.172e-3, 0.011e-3, "H")).L_q
+    assert 0.8e-3 - 0.445e-3 - 2.0 * 0.172e-3 < statistical_half_width(beside) < 0.5 * L_q.value
+
+
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.95])
 def test_a_shaft_that_friction_would_stop_is_driven_through_its_windows(share: float) -> None:
     """A q current keeps the speed, of the largest d current. From 0.1 of it on psi_f and all that needs it was lost.

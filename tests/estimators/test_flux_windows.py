@@ -503,7 +503,7 @@ def test_two_flux_linkages_are_weighted_by_their_variances() -> None:
 def test_a_check_compares_what_both_do_not_share() -> None:
     found = cross_check("b", "a", Estimate(1.02, 0.05, 0.0, "1"), Estimate(1.0, 0.03, 0.0, "1"), 0.02)
     assert found.difference == pytest.approx(0.02, rel=EXACT)
-    own = (0.05 / 1.02) ** 2 - 0.02**2 + 0.03**2 - 0.02**2
+    own = 1.02**2 * ((0.05 / 1.02) ** 2 - 0.02**2 + 0.03**2 - 0.02**2)  # of a ratio of 1.02
     assert found.half_width == pytest.approx(COVERAGE_FACTOR * math.sqrt(own), rel=EXACT)
     assert found.verdict == f"agrees with a: +2 % off, interval of that {100.0 * found.half_width:.3g} %"
 
