@@ -12,7 +12,8 @@ import csv
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,13 @@ class Trace(Summarised):
 
     def __len__(self) -> int:
         return len(self.t_s)
+
+    def rows(self, which: slice | NDArray[np.bool_]) -> Trace:
+        """Return the trace of some of its rows, at their instants."""
+        signals: Any = copy(self.signals)  # those of a file name it where one is missing
+        for name, values in self.signals.items():
+            signals[name] = values[which]
+        return replace(self, t_s=self.t_s[which], signals=signals)
 
     @property
     def period_s(self) -> float:

@@ -55,6 +55,16 @@ def test_any_number_survives(tmp_path_factory, values, suffix):
     assert_same(read_trace(path), trace)
 
 
+def test_some_rows_of_a_trace_are_those_of_all_its_signals(tmp_path):
+    whole = make_trace()
+    for which in (slice(3, 8), whole["i_d_a"] > 0.1):
+        part = whole.rows(which)
+        assert_same(part, Trace(whole.t_s[which], {n: whole[n][which] for n in NAMES}, UNITS, whole.meta))
+    write_trace(whole, tmp_path / "trace.csv")
+    with pytest.raises(ConfigError, match="i_q_a"):  # still says which file has no such signal
+        read_trace(tmp_path / "trace.csv").rows(slice(2)).signals["i_q_a"]
+
+
 def test_same_trace_same_bytes():
     assert trace_npz(make_trace()) == trace_npz(make_trace())
     assert trace_csv(make_trace()) == trace_csv(make_trace())

@@ -288,11 +288,9 @@ def _parts(whole: Trace, i_q_a: float, push_s: float) -> tuple[Trace, Trace]:
     pushed = int(push_s / whole.period_s)
     over = np.nonzero(np.abs(whole["i_q_a"][pushed:]) <= CURRENT_OFF * abs(i_q_a))[0]
     ends = pushed, min(pushed + (int(over[0]) if len(over) else len(whole)), len(whole) - 2)  # a current may not go
-    push, coasting = (
-        replace(whole, t_s=whole.t_s[part] - whole.t_s[part][0], signals={n: whole[n][part] for n in whole.signals})
-        for part in (slice(0, ends[0]), slice(ends[1], None))
-    )
-    return push, replace(coasting, meta={**whole.meta, "coasting": True, POWERED: True})
+    push, coasting = whole.rows(slice(0, ends[0])), whole.rows(slice(ends[1], None))
+    meta = {**whole.meta, "coasting": True, POWERED: True}
+    return push, replace(coasting, t_s=coasting.t_s - coasting.t_s[0], meta=meta)
 
 
 def _speed(trace: Trace, *, first_rows: bool = False) -> float:

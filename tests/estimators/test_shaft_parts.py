@@ -249,6 +249,20 @@ def test_a_trace_begins_where_the_shaft_moves_and_its_step_is_over() -> None:
     assert mechanics._window(replace(coast, meta={"coasting": False})).t_s[0] == t[at]
 
 
+def test_a_coasting_ends_before_the_shaft_rests() -> None:
+    """Under Coulomb friction half a percent of the way is left at 7 % of the speed; a push and a turning shaft stay."""
+    t = 0.01 * np.arange(400)
+    theta = -np.minimum(t, 2.0) * (4.0 - np.minimum(t, 2.0))
+    last = int(np.flatnonzero(theta - theta[-1] > 0.005 * np.ptp(theta))[-1]) + 1
+    for direction in (-1.0, 1.0):
+        run = _trace(t, {"coasting": True}, theta_M_rad=direction * theta)
+        assert mechanics._window(run).t_s[-1] == t[last] == pytest.approx(2.0 * (1.0 - math.sqrt(0.005)), abs=0.01)
+        pushed = _trace(t, {"coasting": False}, theta_M_rad=direction * theta, flagged=np.zeros(400))
+        assert mechanics._window(pushed).t_s[-1] == t[-1]
+    turning = _trace(t, {"coasting": True}, theta_M_rad=t)
+    assert mechanics._window(turning).t_s[-1] == pytest.approx(t[-1], abs=0.021)
+
+
 def test_the_fast_part_of_a_trace_is_its_longest_above_a_fifth_of_its_speed() -> None:
     speed = np.concatenate([np.full(50, 10.0), np.full(100, 1.0), np.full(200, 8.0), np.full(50, 0.5)])
     theta = np.concatenate([[0.0], np.cumsum(speed)])

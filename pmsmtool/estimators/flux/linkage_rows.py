@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,12 +184,9 @@ def usable(speeds: Trace) -> tuple[Trace, str]:
     left_out = limited | moved
     for pair in map(list, pairs_of(speeds)):
         left_out[pair] = np.any(left_out[pair])
-    kept: Any = copy.copy(speeds.signals)  # those of a file name it where one is missing
-    for name, values in speeds.signals.items():
-        kept[name] = values[~left_out]
     whys = ("limited by voltage or current",) * bool(np.any(limited)) + ("not settled",) * bool(np.any(moved))
     told = f"{np.sum(left_out)} of {len(speeds)} windows left out, {' or '.join(whys)}" if whys else ""
-    return replace(speeds, t_s=speeds.t_s[~left_out], signals=kept), told
+    return speeds.rows(~left_out), told
 
 
 def check_speeds(speeds: Trace, pairs: Sequence[tuple[int, int]], whole: Trace) -> None:

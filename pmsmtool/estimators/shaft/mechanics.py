@@ -340,21 +340,24 @@ def _fast(run: Trace) -> Trace:
     fast = np.concatenate([[False], speed >= LEAST_SPEED * np.max(speed), [False]])
     starts, ends = np.flatnonzero(np.diff(fast)).reshape(-1, 2).T
     longest = int(np.argmax(ends - starts))
-    part = slice(int(starts[longest]), int(ends[longest]) + count)
-    return replace(run, t_s=run.t_s[part], signals={name: values[part] for name, values in run.signals.items()})
+    return run.rows(slice(int(starts[longest]), int(ends[longest]) + count))
 
 
 def _window(run: Trace) -> Trace:
-    """Return a trace from where the shaft moves and the step of the current is over.
+    """Return a trace from where the shaft moves and the step of the current is over; a coasting up to where it rests.
 
-    At rest, the first speed leaves no slope for a fit to go down; and a step may meet the voltage limit.
+    At rest, the first speed leaves no slope for a fit to go down; and a step may meet the voltage limit. Near the end
+    friction is neither Coulomb's nor viscous: with it B of a shaft was 4.7 % off at +-3.3 %, of one tau_c 17 at +-9.
     """
     theta = run["theta_M_rad"]
-    first = int(np.argmax(np.abs(theta - theta[0]) > REST_SHARE * np.ptp(theta)))
-    if not run.meta["coasting"]:
+    least, last = REST_SHARE * np.ptp(theta), len(theta)
+    first = int(np.argmax(np.abs(theta - theta[0]) > least))
+    if run.meta["coasting"]:
+        last += 1 - int(np.argmax(np.abs(theta - theta[-1])[::-1] > least))
+    else:
         limited = np.nonzero(run["flagged"][: round(STEP_SHARE * len(run))] > 0.0)[0]
         first = max(first, int(limited[-1]) + 1 if len(limited) else 0)
-    return replace(run, t_s=run.t_s[first:], signals={name: values[first:] for name, values in run.signals.items()})
+    return run.rows(slice(first, last))
 
 
 def _blocks(run: Trace, torque: Torque, sigma_nm: float, direction: int, pole_pairs: int, step: float,
