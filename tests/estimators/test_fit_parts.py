@@ -184,14 +184,17 @@ def test_a_larger_resistance_than_the_loop_s_is_no_model_where_eddy_currents_fit
         assert kept == pytest.approx(0.01, abs=0.02)
 
 
-def test_two_inductances_are_known_no_better_than_half_their_difference() -> None:
+@pytest.mark.parametrize(("log_ratio", "share"), [(0.05, 0.5), (-0.05, 1.0)])
+def test_two_inductances_are_known_no_better_than_half_their_difference(log_ratio: float, share: float) -> None:
+    """Nor, where L falls with the period, than by all of it: no eddy currents do that."""
     shots = _shots()
     slow = [shot.slow_basis() for shot in shots]
-    apart = (_fit([0.0, 1.0, 1.0, -2.0, 0.05, 0.0, 0.3, -0.2], 10.0, size=1e6), _layout(dispersion=True))
+    apart = (_fit([0.0, 1.0, 1.0, -2.0, log_ratio, 0.0, 0.3, -0.2], 10.0, size=1e6), _layout(dispersion=True))
     plain = (_fit([0.0, 1.0, 1.0, 0.3, -0.2], 900.0), _layout(lag=False))
     found = axis_fit._average(shots, slow, 0.05, {apart[1].effects: apart, plain[1].effects: plain}, None)
-    assert found.L_by_shot_h == pytest.approx((2e-3, 2e-3 * math.exp(0.05)), rel=EXACT)
-    assert found.std_h == pytest.approx(0.5 * 2e-3 * math.expm1(0.05), rel=1e-3)  # the fit's own is 1e-7 of it
+    assert found.L_by_shot_h == pytest.approx((2e-3, 2e-3 * math.exp(log_ratio)), rel=EXACT)
+    # the fit's own is 1e-7 of it
+    assert found.std_h == pytest.approx(share * 2e-3 * abs(math.expm1(log_ratio)), rel=1e-3)
 
 
 # ---- the instant of the samples ---------------------------------------------------------------------------------

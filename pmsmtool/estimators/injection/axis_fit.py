@@ -343,8 +343,9 @@ def _average(
     for w, L_m, (_, fit, layout, covariance) in zip(weights, L_each, rows, strict=True):
         if w > NEGLIGIBLE_WEIGHT:
             sizes = [response.model.flux_inductance_h for response in layout.responses(fit.x)]
-            # an inductance that depends on the frequency is not known better than by half that difference
-            spread = DISPERSION_SHARE * (max(sizes) - min(sizes))
+            # an inductance that depends on the frequency is not known better than by half that difference, by all of it
+            # where it falls with the period: no eddy currents do that, but a rotor that friction does not let follow
+            spread = (DISPERSION_SHARE if sizes[0] == min(sizes) else 1.0) * (max(sizes) - min(sizes))
             variance += float(w) * (L_m**2 * float(covariance[0, 0]) + (L_m - L) ** 2 + spread**2)
     effects, fit, layout, _ = rows[int(np.argmax(weights))]
     covariance, condition = scaled_covariance(fit.jacobian)
