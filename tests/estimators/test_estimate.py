@@ -127,6 +127,18 @@ def test_noise_is_the_scatter_about_a_straight_line() -> None:
     assert (noise.offset_d_a, noise.offset_q_a) == pytest.approx(np.mean(currents, axis=1), rel=EXACT)
 
 
+@pytest.mark.parametrize("hertz", [0.0521, 0.31, 0.44])
+def test_what_oscillates_at_zero_current_is_no_noise(hertz: float) -> None:
+    """Measured: 1.21 to 1.37 of the noise, by leakage where the line is a dozen times as large."""
+    trace, currents = _idle(1024)
+    plain = estimate_noise(trace).sigma_a
+    for share, largest in ((1.0, 2.0), (12.0, 1.5)):
+        for current, phase in zip(currents, (0.3, 1.9), strict=True):
+            current += share * 0.025 * np.sin(2.0 * math.pi * hertz * trace.t_s + phase)
+        found = estimate_noise(Trace(trace.t_s, dict(zip(trace.signals, currents, strict=True)), trace.units)).sigma_a
+        assert plain < found < largest * plain
+
+
 def test_too_few_samples_and_a_converter_that_shows_one_step_are_refused() -> None:
     assert estimate_noise(_idle(MINIMUM_SAMPLES, q=0.0)[0]).sigma_a > 0.0  # one axis that rests is no fault
     with pytest.raises(IdentificationError, match="E_EXCITATION: 255 samples"):
