@@ -162,12 +162,12 @@ def done(*arguments: str) -> Any:
 def learned(family: str, channel: str) -> None:
     """Learn the gains of the uncoupled motor's drive into ``mine.toml``, as a person does."""
     drive = ("--map", LEARNED[family], "--sim", channel)
-    done("backup", "-o", "before.json", *drive)
-    answer = done("map", "learn", "--machine", "motor.toml", "-o", "mine.toml", "--shaft", "free", "--yes", *drive)
-    unknown = [f"{gain['name']}: {gain['why']}" for gain in answer["gains"] if gain["scale"] is None]
+    learn = ("map", "learn", *GAINS, "--machine", "motor.toml", "-o", "mine.toml", "--shaft", "free", "--yes")
+    gains = [gain for gain in done(*learn, *drive)["gains"] if gain["name"] in GAINS]
+    unknown = [f"{gain['name']}: {gain['why']}" for gain in gains if gain["scale"] is None]
     if unknown:
         raise RuntimeError(f"map learn: not decided: {'; '.join(unknown)}")
-    if len(answer["gains"]) < len(GAINS):
+    if len(gains) < len(GAINS):
         raise RuntimeError(f"map learn: no object is known for one of {', '.join(GAINS)}")
 
 

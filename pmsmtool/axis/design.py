@@ -11,6 +11,7 @@ import numpy as np
 
 from pmsmtool.axis.drive import (
     CASCADE,
+    LEAD,
     NOTCH,
     PID,
     PROFILE,
@@ -112,15 +113,19 @@ def move_peaks(
 
     ``held``: the feed-forwards that a drive holds, by catalogue name.
     """
-    plain, added = following_error(plant, path, gains, move, held.get(CASCADE[1], 0.0))
-    error, torque = np.max(np.abs(plain + held.get(CASCADE[2], 0.0) / path.shaft.J * added), axis=1)
+    leads = LEAD in held
+    plain, added = following_error(plant, path, gains, move, held.get(CASCADE[1], 0.0), leads=leads)
+    forward = held[LEAD] * gains.K_p if leads else held.get(CASCADE[2], 0.0)
+    error, torque = np.max(np.abs(plain + forward / path.shaft.J * added), axis=1)
     return float(error) + friction_nm / gains.pid[0], float(torque) + friction_nm
 
 
 def best_forward(box: Box, gains: AxisGains, move: Move, drive: AxisDrive) -> tuple[float, float]:
     """Return the share of the inertia to feed forward and the following error (rad), with what acts on this drive."""
-    plain, added = following_error(box.plant, box.path, gains, move, float(drive.feeds(CASCADE[1])))
-    return best_share(plain, added if drive.feeds(CASCADE[2]) else np.zeros_like(added))
+    plain, added = following_error(
+        box.plant, box.path, gains, move, float(drive.feeds(CASCADE[1])), leads=drive.leads
+    )  # fmt: skip
+    return best_share(plain, added if drive.leads or drive.feeds(CASCADE[2]) else np.zeros_like(added))
 
 
 def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDesign:
@@ -324,6 +329,7 @@ def axis_values(
         CASCADE[0]: DesignValue(position.K_v, how, POSITION_LOOP),
         CASCADE[1]: DesignValue(1.0, "the whole speed of the reference"),
         CASCADE[2]: DesignValue(inertia_share * J, forward),
+        LEAD: DesignValue(inertia_share * J / position.K_p, forward),
         PID[0]: DesignValue(K_P, how, POSITION_LOOP),
         PID[1]: DesignValue(K_I, how, POSITION_LOOP),
         PID[2]: DesignValue(K_D, how, POSITION_LOOP),
@@ -335,8 +341,11 @@ def axis_values(
             rpm_from_rad_s(profile.jerk), "a ramp of one period of the load's own swing, or of 4 J / K_p"
         ),
     }
-    told = (*SPEED, *NOTCH, *(() if drive.pid else CASCADE))  # without an object, too: a person enters them
+    # without an object, too: a person enters them
+    told = (*SPEED, *NOTCH, *(() if drive.pid else CASCADE[: 2 if drive.leads else 3]))
     values = {name: value for name, value in found.items() if name in drive.offers or name in told}
+    if not drive.leads:
+        values.pop(LEAD, None)
     if drive.amperes:
         K_t = assumed_torque(machine)
         how = "1.5 p psi_f per ampere, between peak and rms: compared, never written"

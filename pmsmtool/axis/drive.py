@@ -26,6 +26,8 @@ PID = (
     "position.pid_p_nm_per_rad", "position.pid_i_nm_per_rads", "position.pid_d_nms_per_rad",
     "position.friction_ff_nms_per_rad",
 )  # fmt: skip
+LEAD = "position.acceleration_ff_s"
+"""Feed-forward of the acceleration that is added to the reference of the speed, not to the torque (Copley)."""
 SPEED = ("speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad")
 SPEED_FORWARD = ("speed.inertia_ff_kgm2", "speed.friction_ff_nms_per_rad")
 NOTCH = ("speed.notch_hz", "speed.notch_zeta_num", "speed.notch_zeta_den")
@@ -33,7 +35,7 @@ PROFILE = (
     "reference.profile_speed_rpm", "reference.profile_acceleration_rpm_per_s",
     "reference.profile_deceleration_rpm_per_s", "reference.profile_jerk_rpm_per_s2",
 )  # fmt: skip
-AXIS_GAINS = (*SPEED, *SPEED_FORWARD, *CASCADE[:2], *PID[:3], CASCADE[2], PID[3])
+AXIS_GAINS = (*SPEED, *SPEED_FORWARD, *CASCADE[:2], *PID[:3], CASCADE[2], LEAD, PID[3])
 AXIS_ROWS = frozenset((TORQUE_PER_AMPERE, INCREMENTS, *AXIS_GAINS, *NOTCH, *PROFILE))
 """What the design of an axis decides, and what is written into a drive for it."""
 LOOSEST = Limits(20.0, 12.0)
@@ -142,6 +144,11 @@ class AxisDrive:
     def jerks(self) -> bool:
         """Whether its moves are limited in jerk."""
         return self.own_core or PROFILE[3] in self.offers
+
+    @property
+    def leads(self) -> bool:
+        """Whether its feed-forward of the acceleration acts through the controller of the speed."""
+        return LEAD in self.offers and CASCADE[2] not in self.offers
 
     def feeds(self, name: str) -> bool:
         """Whether a feed-forward acts as designed: it is written, or a person enters the whole axis by hand."""

@@ -300,13 +300,14 @@ SHARES = np.linspace(0.0, 1.0, 21)
 
 
 def following_error(
-    plant: Lifted, path: AxisPath, gains: AxisGains, move: Move, speed_share: float = 1.0
+    plant: Lifted, path: AxisPath, gains: AxisGains, move: Move, speed_share: float = 1.0, *, leads: bool = False
 ) -> tuple[Array, Array]:
     """Return following error (rad) and torque (N m) of a move there and back, shape (2, n), by samples of the loops.
 
     Both are periodic and without their mean.
 
-    ``speed_share``: of the move's speed, that a cascade feeds forward.
+    ``speed_share``: of the move's speed, that a cascade feeds forward. ``leads``: the acceleration is fed forward to
+    the reference of the speed; one unit of it is then J / K_p times the acceleration.
 
     Returns
     -------
@@ -325,11 +326,12 @@ def following_error(
     reference, fast, force = (np.fft.rfft(signal)[1:] for signal in (place, speed, acceleration))
     # what the controller multiplies the reference with: as the angle that is fed back, its speed exact where a cascade
     # takes that from the profile
-    asked = angle * reference
+    asked, through = angle * reference, np.ones_like(z)
     if path.structure == "cascade":
         control = slip if path.pll_rad_s else _speed_control(path, gains, z)
         asked = control * (gains.K_v * reference + speed_share * fast)
-    torque, more = asked / back, path.shaft.J * force / back
+        through = control / gains.K_p if leads else through
+    torque, more = asked / back, path.shaft.J * through * force / back
     plain, added = np.zeros((2, 2, half + 1), np.complex128)
     plain[:, 1:], added[:, 1:] = (reference - seen[0] * torque, torque), (-seen[0] * more, more)
     return np.fft.irfft(plain, 2 * half), np.fft.irfft(added, 2 * half)

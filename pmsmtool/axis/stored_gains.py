@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from pmsmtool.axis.design import AxisDesign, best_forward, judged_design, move_peaks, own_move
-from pmsmtool.axis.drive import CASCADE, NOTCH, PID, SPEED, SPEED_FORWARD, AxisDrive, gain_rows, held_loop
+from pmsmtool.axis.drive import CASCADE, LEAD, NOTCH, PID, SPEED, SPEED_FORWARD, AxisDrive, gain_rows, held_loop
 from pmsmtool.axis.loops import AxisGains
 from pmsmtool.axis.move import Move
 from pmsmtool.design.design_file import DesignValue, Scalar
@@ -73,9 +73,10 @@ def _kept(made: AxisDesign, speed: AxisGains, position: AxisGains, move: Move, d
     how = "as the drive holds it"
     gains = {name: DesignValue(value, how, design.values[name].loop) for name, value in values.items()}
     forward = f"{share:g} of the inertia: the least predicted following error"
+    fed = {CASCADE[2]: share * J, SPEED_FORWARD[0]: share * J, LEAD: share * J / position.K_p}
     gains |= {
-        name: DesignValue(share * J, forward)
-        for name in (*CASCADE[2:], SPEED_FORWARD[0])
+        name: DesignValue(value, forward)
+        for name, value in fed.items()
         if name in design.values and name in drive.offers
     }
     facts = {

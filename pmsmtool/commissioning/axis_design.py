@@ -15,6 +15,7 @@ from pmsmtool.axis.design import with_axis
 from pmsmtool.axis.drive import (
     AXIS_ROWS,
     CASCADE,
+    LEAD,
     PID,
     SPEED,
     SPEED_FORWARD,
@@ -239,7 +240,7 @@ def design_axis(
             for worst, fact in ((min, "phase_least_deg"), (max, "S_peak_db"))
         )
         notes += (f"margins not met: {phase:.3g} deg and {peak:.3g} dB, asked for are {made.limits}",)
-    if CASCADE[2] in less or CASCADE[0] in slower:  # the errors were predicted with all of it
+    if less.keys() & {CASCADE[2], LEAD} or CASCADE[0] in slower:  # the errors were predicted with all of it
         kept = {name: fact for name, fact in design.facts.items() if name not in PREDICTED}
         design = replace(design, facts=kept)
     return replace(design, notes=(*design.notes, *notes))
@@ -265,7 +266,7 @@ def _largest(cell: Cell) -> float:
 def _cut(drive_map: DriveMap, wanted: ParameterSet) -> dict[str, float]:
     """Return the feed-forwards that are beyond what their objects hold, as much as these do."""
     found = {}
-    for name in (*SPEED_FORWARD, *CASCADE[1:], *PID[3:]):
+    for name in (*SPEED_FORWARD, *CASCADE[1:], LEAD, *PID[3:]):
         if name in drive_map.cells and name in wanted.values and drive_map.writes(name, wanted.values):
             cell = drive_map.cells[name]
             counts = cell.counts(wanted.values[name], wanted.values)
@@ -298,14 +299,14 @@ def _slowed(drive_map: DriveMap, group: dict[str, int], wanted: ParameterSet) ->
 
 def not_offered(drive_map: DriveMap) -> dict[str, str]:
     """Return the gains of an axis that a drive has no object for, with the reason its map gives."""
-    position = PID[:3] if PID[0] in drive_map.cells else CASCADE
+    position = PID[:3] if PID[0] in drive_map.cells else CASCADE[: 2 if LEAD in drive_map.cells else 3]
     return drive_map.not_written([name for name in (*SPEED, *position) if name not in drive_map.cells])
 
 
 def axis_parameters(design: Design) -> ParameterSet:
     """Return what of a design is written for its axis."""
     whole = design.parameter_set()
-    other = CASCADE[:2] if design.facts["axis_structure"] == "pid" else ()
+    other = CASCADE[:2] if design.facts["axis_structure"] == "pid" else CASCADE[2:] if LEAD in whole.values else ()
     kept = {name: value for name, value in whole.values.items() if name in AXIS_ROWS and name not in other}
     said = {name: text for name, text in whole.provenance.items() if name in kept or name == "machine"}
     return replace(whole, values=kept, tables={}, provenance=said)

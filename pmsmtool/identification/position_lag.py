@@ -12,9 +12,12 @@ so that f is the coefficient of omega_ref over that of -omega. A drive takes its
 in position and current alike: least squares then find a feed-forward that is none. Where they find one, two-stage least
 squares decide, by what the demand alone makes of the position, and with the lag's own gain for K_v / (1 - f).
 
-A feed-forward that has an object is 0 for this; what it counts then follows from the lag with it over that without. A
-loop whose lag does not settle (an integral part of the position, or one controller of the position) is none of this
-kind.
+A feed-forward that has an object is 0 for this; what it counts then follows from the lag with it over that without.
+Where a drive adds T_a times the acceleration of the demand to the reference of its speed, that acts as the derivative
+of a speed fed forward. So over a ramp it takes T_a omega / K_v from the integral of the lag, once that has settled: T_a
+is the difference of two integrals over the lag. What friction does on the way is gone by then: the loop has an integral
+part. A loop whose lag does not settle (an integral part of the position, or one controller of the position) is none of
+this kind.
 """
 
 from __future__ import annotations
@@ -134,6 +137,40 @@ def fed_share(trace: Trace, without: PositionLag) -> tuple[float, float]:
     return share, math.hypot(own, (1.0 - share) * without.std, LATE_S * without.gain_per_s)
 
 
+def ramp_areas(trace: Trace) -> Array:
+    """Return what the ramp of a move adds to the integral of the lag over time, with its doubt, and the settled lag.
+
+    In rad s, rad s and rad, shape (3, moves). A constant time between demand and position adds nothing. Raises
+    IdentificationError: as :func:`position_lag`.
+    """
+    t, demand, position = trace.t_s, trace["theta_ref_rad"], trace["theta_m_rad"]
+    speeds, lags = (quarters.reshape(-1, 2) for quarters in _even_lags(trace))
+    rests = np.flatnonzero(np.interp(t - WINDOW_S, t, demand) == demand)  # one sample may show a demand twice
+    found = []
+    for (first, last), speed, (lag, later) in zip(_even_parts(t, demand), speeds.mean(axis=1), lags, strict=True):
+        began = rests[np.searchsorted(rests, first) - 1]
+        ended = int(np.searchsorted(t, 0.5 * (t[first] + t[last])))
+        way, settled = demand[ended] - demand[began], 0.5 * (lag + later)
+        lagged = np.trapezoid((demand - position)[began : ended + 1], t[began : ended + 1])
+        even_s = abs(way) / speed
+        area = math.copysign(1.0, way) * float(lagged) - even_s * settled
+        found.append((area, even_s * 0.5 * abs(later - lag), settled))
+    return np.array(found).T
+
+
+def led_s(trace: Trace, without: Array) -> tuple[float, float]:
+    """Return the time by which the acceleration leads the speed (s) in moves, and its standard deviation.
+
+    ``without``: :func:`ramp_areas` of the same moves, the same gains, and nothing fed forward.
+    """
+    areas, doubts, lags = without
+    less, more_doubts, _ = ramp_areas(trace)
+    led = (areas - less) / np.mean(lags)
+    drift = np.hypot(doubts, more_doubts) / np.mean(lags)
+    each = math.hypot(float(np.std(led, ddof=1)), float(np.sqrt(np.mean(drift**2))))
+    return float(np.mean(led)), math.hypot(each / math.sqrt(led.size), CHANGE_STD * float(np.max(led)))
+
+
 def _even_parts(t: Array, demand: Array) -> Iterator[tuple[int, int]]:
     """Yield first and last sample of every part in which the demand moves evenly at its largest speed."""
     ahead, behind = (np.interp(t + 0.5 * over_s, t, demand) for over_s in (EVEN_OVER_S, -EVEN_OVER_S))
@@ -225,13 +262,17 @@ def position_scale(
     return Learned(name, per_count, half, "value", UNIT)
 
 
-def forward_scale(counts: float, share: float, std: float, name: str) -> Learned:
-    """Return what one count of the feed-forward of the speed is worth (1), from the share that some counts feed."""
+def forward_scale(counts: float, share: float, std: float, name: str, unit: str = "1") -> Learned:
+    """Return what one count of a feed-forward is worth, from what some counts feed.
+
+    ``unit``: 1, the share of the speed; s, the time by which the acceleration leads.
+    """
     half = NORMAL_95 * std / abs(share) if share else math.inf
     if not share > 0.0 or half > WIDEST:
-        fed = f"{counts:.9g} counts feed {100.0 * share:.0f} +-{100.0 * NORMAL_95 * std:.0f} % of the speed forward"
+        size, of = (100.0, "% of the speed") if unit == "1" else (1e3, "ms of the acceleration")
+        fed = f"{counts:.9g} counts feed {size * share:.2g} +-{size * NORMAL_95 * std:.2g} {of} forward"
         return Learned(name, None, half, None, "", fed)
-    return Learned(name, share / counts, half, "value", "1")
+    return Learned(name, share / counts, half, "value", unit)
 
 
 def _refused(what: str, likely: str) -> IdentificationError:

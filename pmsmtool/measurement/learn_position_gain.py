@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: MIT
 """``map learn``, its second part: moves at even speed with the drive's own position gain, and with 0.7 of it.
 
-The only change of the gain is a step down. The feed-forward of the speed is 0 meanwhile, where it has an object; it is
-learned last, with the drive's own counts, or with as many as are seen, from one upwards.
+The only change of the gain is a step down. The feed-forwards of speed and acceleration are 0 meanwhile, where they have
+objects; they are learned last, with the drive's own counts, or with as many as are seen, from one upwards.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+from pmsmtool.arrays import Array
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
@@ -20,7 +22,15 @@ from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.errors import IdentificationError, LimitExceeded, NotAvailable, SafetyRefusal
 from pmsmtool.experiments.move import record_move
 from pmsmtool.identification.learned_gains import Learned
-from pmsmtool.identification.position_lag import PositionLag, fed_share, forward_scale, position_lag, position_scale
+from pmsmtool.identification.position_lag import (
+    PositionLag,
+    fed_share,
+    forward_scale,
+    led_s,
+    position_lag,
+    position_scale,
+    ramp_areas,
+)
 from pmsmtool.measurement.changed_gains import (
     DOWN,
     FLOATS_FROM,
@@ -32,8 +42,10 @@ from pmsmtool.measurement.changed_gains import (
     refuse_unsafe,
 )
 from pmsmtool.measurement.learn_gains import SEEN_S
+from pmsmtool.trace import Trace
 
-POSITION, FORWARD = "position.K_p_per_s", "position.velocity_ff"
+POSITION = "position.K_p_per_s"
+FORWARDS = FORWARD, LEAD = "position.velocity_ff", "position.acceleration_ff_s"
 SPEED_RAD_S, RAMP_S, EVEN_S = 2.0 * math.pi, 0.25, 3.0
 """A turn per second: cogging is even over a turn; three of them, so that gains down to 3 1/s settle."""
 WAY_RAD = SPEED_RAD_S * (EVEN_S + RAMP_S)
@@ -50,6 +62,8 @@ BEHIND = 0.5
 SEEN, AIM, GROWTH, FORWARD_MOVES = 0.3, 0.8, 8.0, 10
 """Share of the speed from which a feed-forward is clearly seen, the one aimed at until then, by how much its counts
 grow at most, and in how many moves: 8^10 is more than four bytes hold."""
+LEAD_SEEN_S, LEAD_AIM_S = 12e-3, 30e-3
+"""The same of a feed-forward of the acceleration: the aim is 0.75 rad/s on the ramps of these moves."""
 
 
 def position_gain(node: DriveNode, address: tuple[int, int] | None = None) -> GainObject | None:
@@ -59,23 +73,24 @@ def position_gain(node: DriveNode, address: tuple[int, int] | None = None) -> Ga
 
 
 def position_gain_objects(node: DriveNode, asked: Mapping[str, tuple[int, int] | None]) -> dict[str, GainObject]:
-    """Return the position gain where it is asked for, and the speed's feed-forward beside it; else none."""
+    """Return the position gain where it is asked for, and the feed-forwards beside it; else none."""
     gain = position_gain(node, asked[POSITION]) if POSITION in asked else None
-    forward = None if gain is None else forward_object(node)
-    return {one.name: one for one in (gain, forward) if one is not None}
+    return {} if gain is None else {POSITION: gain, **forward_objects(node)}
 
 
 def _place(node: DriveNode, name: str) -> tuple[int, int] | None:
     return next((address for address in named_addresses(node, name) if node.has(*address)), None)
 
 
-def forward_object(node: DriveNode) -> GainObject | None:
-    """Return the object of the speed's feed-forward, whatever it holds; None without one of whole numbers."""
-    where = node.map.address(FORWARD) if FORWARD in node.map.cells else _place(node, FORWARD)
-    try:
-        return None if where is None else gain_object(node, FORWARD, *where, may_be_zero=True)
-    except NotAvailable:
-        return None
+def forward_objects(node: DriveNode) -> dict[str, GainObject]:
+    """Return the objects of both feed-forwards, whatever they hold, as far as they are whole numbers."""
+    found = {}
+    for name in FORWARDS:
+        where = node.map.address(name) if name in node.map.cells else _place(node, name)
+        with contextlib.suppress(NotAvailable):
+            if where is not None:
+                found[name] = gain_object(node, name, *where, may_be_zero=True)
+    return found
 
 
 def learn_position_gain(
@@ -83,7 +98,7 @@ def learn_position_gain(
 ) -> tuple[dict[str, Learned], LimitExceeded | None]:
     """Return what one count of the position gain is worth, or why that stays unknown; the drive is as before.
 
-    Beside it what one count of the speed's feed-forward is worth, where that has an object. What was learned of other
+    Beside it what one count of either feed-forward is worth, where that has an object. What was learned of other
     gains stays where this is refused: that is the reason then. A limit of the motion that stopped the shaft is returned
     beside it, for the caller to raise.
 
@@ -98,7 +113,7 @@ def learn_position_gain(
             drive.close()
     except (IdentificationError, NotAvailable, SafetyRefusal) as error:
         likely = f" (likely: {error.likely})" if error.likely else ""
-        name = FORWARD if POSITION in found else POSITION
+        name = next((name for name in (POSITION, *forward_objects(node)) if name not in found), POSITION)
         found[name] = Learned(name, None, math.inf, None, "", error.what.partition("\n")[0] + likely)
         return found, error if isinstance(error, LimitExceeded) else None
     return found, None
@@ -110,38 +125,51 @@ def _moved(
     """Move with the gain as it is and with less of it, then with the speed fed forward; note what is found."""
     node = drive.node
     refuse_unsafe(node, envelope)
-    forward = forward_object(node)
-    written = [gain] if forward is None else [gain, forward]
+    forwards = forward_objects(node)
+    written = [gain, *forwards.values()]
     drive.error_limit_rad = BEHIND * WAY_RAD
     lags: list[tuple[float, PositionLag]] = []
+    areas: list[Array] = []
     envelope = replace(envelope, travel_rad=TRAVEL * WAY_RAD)
     if not limits_speed(node):
         envelope = replace(envelope, i_max_apk=envelope.i_max_apk * UNWATCHED_SHARE)
     with changing(drive, written, envelope, say) as (guard, put):
-        if forward is not None and forward.counts:
-            put(forward, 0.0)
+        for forward in forwards.values():
+            if forward.counts:
+                put(forward, 0.0)
         record_move(guard, drive, SHORT_RAD, REST_S, find=(SPEED_RAD_S, SPEED_RAD_S / RAMP_S))
         for counts in (gain.counts, changed_counts(gain, DOWN)):
             if lags:
                 put(gain, counts)
             trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
             lags.append((counts, position_lag(trace, drive.rad_per_count)))
+            if LEAD in forwards:
+                areas.append(ramp_areas(trace))
             say(f"{gain.address} = {counts:.9g}: speed over lag {lags[-1][1].gain_per_s:.4g} 1/s")
         put(gain, gain.counts)
-        told = position_scale(lags[0], lags[1], POSITION, forward_is_zero=forward is not None)
+        told = position_scale(lags[0], lags[1], POSITION, forward_is_zero=FORWARD in forwards)
         found[POSITION] = told
-        if forward is not None and told.scale is not None:
+
+        def learn(name: str, seen: float, aim: float, unit: str, fed: Callable[[Trace], tuple[float, float]]) -> None:
+            """Feed forward until it is seen; note what one count of it is worth."""
+            forward = forwards[name]
             counts = forward.counts or 1.0
             for _ in range(FORWARD_MOVES):
                 put(forward, counts)
                 trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
-                share, std = fed_share(trace, lags[0][1])
-                say(f"{forward.address} = {counts:.9g}: {100.0 * share:.3g} % of the speed fed forward")
-                more = round(counts * min(GROWTH, AIM / max(share, AIM / GROWTH)))
-                if share > SEEN or more > _most(forward):
+                share, std = fed(trace)
+                say(f"{forward.address} = {counts:.9g}: {share:.3g} {unit} fed forward")
+                more = round(counts * min(GROWTH, aim / max(share, aim / GROWTH)))
+                if share > seen or more > _most(forward):
                     break
                 counts = more
-            found[FORWARD] = forward_scale(counts, share, std, FORWARD)
+            found[name] = forward_scale(counts, share, std, name, unit)
+            put(forward, 0.0)
+
+        if FORWARD in forwards and told.scale is not None:
+            learn(FORWARD, SEEN, AIM, "1", lambda trace: fed_share(trace, lags[0][1]))
+        if LEAD in forwards and told.scale is not None:
+            learn(LEAD, LEAD_SEEN_S, LEAD_AIM_S, "s", lambda trace: led_s(trace, areas[0]))
         for item in written:
             put(item, item.counts)
 

@@ -289,6 +289,8 @@ CLOSED_DRIVE: tuple[Parameter, ...] = (
         "torque per integral of it"),
     Parameter("position.pid_d_nms_per_rad", 0x2022, 7, _F32, "N m s/rad", 0, 0, 1e6, True,
         "torque per derivative of it"),
+    Parameter("position.acceleration_ff_s", 0x2022, 8, _F32, "s", 0, 0, 10, True,
+        "speed per move acceleration, added to the reference of the speed"),
 )
 """What other makers' drives have besides: limits of CiA 402, speed and position loops. Not in the reference drive's image."""
 # fmt: on

@@ -14,9 +14,10 @@ import pytest
 
 from benchmarks.axis_loads import loaded
 from pmsmtool.axis import search
-from pmsmtool.axis.design import move_peaks, profile_of, profile_within, with_axis
+from pmsmtool.axis.design import move_peaks, own_move, profile_of, profile_within, with_axis
 from pmsmtool.axis.drive import (
     CASCADE,
+    LEAD,
     LOOSEST,
     PID,
     SPEED,
@@ -195,6 +196,34 @@ def test_a_position_loop_is_no_faster_than_a_speed_loop_that_its_objects_slow(K_
     assert cut[CASCADE[0]] == pytest.approx(0.25 * whole[CASCADE[0]], rel=1e-3)
     assert cut[SPEED[0]] == pytest.approx(K_p_most * whole[SPEED[0]], rel=1e-3)
     assert cut.facts["axis_margins_kept"]
+
+
+@pytest.mark.chain
+def test_an_acceleration_may_be_fed_forward_to_the_speed_alone() -> None:
+    """0x60FB:03 of a Copley stayed as it was: two of three drives followed 1.5 and 4.9 times as far as before."""
+    rows = [
+        MeasuredRow(SPEED[0], 0x60F9, 1, "UNSIGNED32", "value", "", 1e-7, "N m s/rad", 0.1),
+        MeasuredRow(SPEED[1], 0x60F9, 2, "UNSIGNED32", "value", "", 1e-7, "N m/rad", 0.1),
+        MeasuredRow(CASCADE[0], 0x60FB, 1, "UNSIGNED32", "value", "", 1e-6, "1/s", 0.1),
+        MeasuredRow(CASCADE[1], 0x60FB, 2, "UNSIGNED16", "value", "", 1e-4, "1", 0.1),
+        MeasuredRow(LEAD, 0x60FB, 3, "UNSIGNED16", "value", "", 1e-6, "s", 0.1),
+    ]
+    plain, led = (
+        design_axis(machine(0.0, 0.0), TuneRequest(), ASKED, with_measured(load_family("cia402"), 9, 1, kept, "", None))
+        for kept in (rows[:4], rows)
+    )
+    assert [led[name] for name in (*SPEED, CASCADE[0])] == [plain[name] for name in (*SPEED, CASCADE[0])]
+    assert float(led.facts["axis_following_error_rad"]) < 0.65 * float(plain.facts["axis_following_error_rad"])
+    share = float(led.facts["axis_inertia_ff_share"])
+    assert led[LEAD] == pytest.approx(share * (led.machine.machine.J_kgm2 or 0.0) / led[SPEED[0]], abs=1e-6)
+    assert LEAD in axis_parameters(led).values and CASCADE[2] not in axis_parameters(led).values
+    assert not any("position.inertia_ff_kgm2" in note for note in led.notes)
+    drive = axis_drive(with_measured(load_family("cia402"), 9, 1, rows, "", None))
+    path, _ = axis_path(led, ASKED, drive, mechanics_of(led.machine))
+    gains, move = AxisGains(*(led[name] for name in (*SPEED, CASCADE[0]))), own_move(led, drive)
+    held = {name: led[name] for name in (CASCADE[1], LEAD)}
+    error = move_peaks(path, lifted(path), gains, move, held, 0.0)[0]
+    assert error == pytest.approx(float(led.facts["axis_following_error_rad"]), rel=1e-3)
 
 
 @pytest.mark.chain

@@ -20,7 +20,7 @@ AGREES_RAD = 1e-5
 """Difference to the samples; measured 4e-6, what the third period still has of the first."""
 
 
-def stepped(path: AxisPath, share: float) -> np.ndarray:
+def stepped(path: AxisPath, share: float, *, leads: bool = False) -> np.ndarray:
     """Return the error of the third period of a move there and back."""
     plant = lifted(path)
     half = int(np.ceil((MOVE.duration_s + 0.5) / T))
@@ -36,25 +36,30 @@ def stepped(path: AxisPath, share: float) -> np.ndarray:
         for k in range(place.size):
             angle = float(plant.c[0] @ x)
             error = place[k] - angle
-            forward = share * path.shaft.J * rise[k]
+            forward, ahead = share * path.shaft.J * rise[k], 0.0
+            if leads:
+                forward, ahead = 0.0, forward / GAINS.K_p
             if path.structure == "pid":
                 slope = (slope + K_D * pole * (error - last_error)) / (1.0 + pole * T)
                 torque, total = K_P * error + slope + total + forward, total + K_I * T * error
             else:
-                slip = GAINS.K_v * error + speed[k] - (angle - last) / T
+                slip = GAINS.K_v * error + speed[k] + ahead - (angle - last) / T
                 torque, total = GAINS.K_p * slip + total + forward, total + GAINS.K_i * T * slip
             last_error, last, errors[k] = error, angle, error
             x = plant.A @ x + plant.b * torque
     return errors
 
 
-@pytest.mark.parametrize("structure", ["cascade", "pid"])
-def test_prediction_is_the_loop_stepped_sample_by_sample(structure: Structure) -> None:
+@pytest.mark.parametrize(("structure", "leads"), [("cascade", False), ("cascade", True), ("pid", False)])
+def test_prediction_is_the_loop_stepped_sample_by_sample(structure: Structure, leads: bool) -> None:
     path = AxisPath(Mechanics(0.015, 0.002, 25.0, 90.0, 0.02), CURRENT, 1, late=1, structure=structure)
-    plain, added = following_error(lifted(path), path, GAINS, MOVE)
-    ours, theirs = (plain + SHARE * added)[0], stepped(path, SHARE)
+    plain, added = following_error(lifted(path), path, GAINS, MOVE, leads=leads)
+    ours, theirs = (plain + SHARE * added)[0], stepped(path, SHARE, leads=leads)
     assert np.max(np.abs(ours - ours.mean() - theirs + theirs.mean())) < AGREES_RAD
     share, peak = best_share(plain, added)
+    if leads:  # the controller's integral part adds to it
+        assert 0.4 < share < 1.0 and peak < 0.65 * np.max(np.abs(plain[0]))
+        return
     assert share > 0.8 and peak < 0.1 * np.max(np.abs(plain[0]))
     # the load swings behind this ramp: measured 1.06 of J a
     needed = path.shaft.J * float(np.max(np.abs(MOVE.at(np.linspace(0.0, MOVE.duration_s, 400))[2])))

@@ -132,17 +132,20 @@ def test_learned_gains_are_the_drawn_ones_and_go_into_a_map(
 POSITION_ROWS: tuple[Row, ...] = (
     (0x6062, 0, "I32", "ro", ""), (0x607A, 0, "I32", "rw", "0"), (0x6081, 0, "U32", "rw", ""),
     (0x6083, 0, "U32", "rw", ""), (0x6084, 0, "U32", "rw", ""), (0x60FB, 1, "U16", "rw", "0"),
-    (0x60FB, 2, "U16", "rw", "0"),
+    (0x60FB, 2, "U16", "rw", "0"), (0x60FB, 3, "U16", "rw", "0"),
 )  # fmt: skip
 
 
 @pytest.mark.chain
 def test_a_learned_position_gain_is_the_drawn_one(tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The drive feeds the whole speed forward: that object is 0 meanwhile, else there is no lag."""
-    monkeypatch.setattr(learn_position_gain, "WAY_RAD", 9.0)
+    """The drive feeds speed and acceleration forward: these objects are 0 meanwhile, else there is no lag."""
+    monkeypatch.setattr(learn_position_gain, "WAY_RAD", 13.0)
     monkeypatch.setattr(learn_position_gain, "REST_S", 0.5)
     bench = Bench(tmp_path, *POSITION_ROWS, modes=0x101)
-    drawn, places = bench.drawn, {"position.K_p_per_s": (0x60FB, 1), "position.velocity_ff": (0x60FB, 2)}
+    drawn, places = bench.drawn, {
+        "position.K_p_per_s": (0x60FB, 1), "position.velocity_ff": (0x60FB, 2),
+        "position.acceleration_ff_s": (0x60FB, 3),
+    }  # fmt: skip
     named = {name: f"0x{index:04X}:{sub:02X} has no unit" for name, (index, sub) in places.items()}
     assert bench.node.session is not None
     forward = bench.node.session.dictionary.find(0x60FB, 2)
@@ -152,6 +155,7 @@ def test_a_learned_position_gain_is_the_drawn_one(tool: Tool, tmp_path: Path, mo
     with connect("pmsmsim", bench.channel) as connection:
         node = DriveNode(connection, 1, drive_map=replace(load_family("cia402"), left_out=named))
         node.write_bytes(0x60FB, 2, round(1.0 / drawn.forward_share).to_bytes(2, "little"))
+        node.write_bytes(0x60FB, 3, round(0.03 / drawn.acceleration_ff_s).to_bytes(2, "little"))
         forward.sink = lambda data: (written.append(data), sink(data))[1]
         before = [node.sdo.read(*place) for place in places.values()]
         gain = learn_position_gain.position_gain(node)
@@ -159,10 +163,10 @@ def test_a_learned_position_gain_is_the_drawn_one(tool: Tool, tmp_path: Path, mo
         envelope = Envelope(i_max_apk=8.0, speed_max_rad_s=60.0, duration_s=60.0)
         found, stopped = learn_position_gain.learn_position_gain(connection, node, gain, envelope, lambda text: None)
         assert [node.sdo.read(*place) for place in places.values()] == before and not any_left()
-    assert stopped is None and [one.why for one in found.values()] == ["", ""]
-    for name, scale in (("position.K_p_per_s", drawn.K_v_per_s), ("position.velocity_ff", drawn.forward_share)):
+    assert stopped is None and [one.why for one in found.values()] == ["", "", ""]
+    for name, scale in zip(places, (drawn.K_v_per_s, drawn.forward_share, drawn.acceleration_ff_s), strict=True):
         assert found[name].scale == pytest.approx(scale, rel=SCALE_TOL)
-    assert written == [bytes(2), before[1], before[1]], "0, then its own counts to be learned, then restored"
+    assert written == [bytes(2), before[1], bytes(2), before[1]], "0, its own counts to be learned, 0, then restored"
     bench.holder.close()
 
 

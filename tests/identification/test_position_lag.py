@@ -16,17 +16,21 @@ from pmsmtool.identification.position_lag import (
     _fed_forward,
     fed_share,
     forward_scale,
+    led_s,
     position_lag,
     position_scale,
+    ramp_areas,
 )
 from pmsmtool.trace import Trace
 
-NAME, FORWARD = "position.K_p_per_s", "position.velocity_ff"
+NAME, FORWARD, LEAD = "position.K_p_per_s", "position.velocity_ff", "position.acceleration_ff_s"
 T_S, J, COUNT = 1e-3, 2e-4, 2.0 * math.pi / 4096.0
 K_TORQUE = 0.4
 SPEED, RAMP_S, EVEN_S, REST_S = 2.0 * math.pi, 0.25, 2.0, 1.0
 LAG_TOL = 1e-3
 """Largest error of the gain without feed-forward (relative); measured 2e-5."""
+LED_TOL = 0.02
+"""Of the time by which the acceleration leads (relative); measured 0.013."""
 JITTER_S = 5e-4
 FORWARD_TOL = 0.03
 """Of the share that is fed forward; measured 0.016."""
@@ -41,8 +45,9 @@ def demand() -> np.ndarray:
 
 
 def moves(
-    K_v: float, forward: float = 0.0, K_i_v: float = 0.0, tau_c: float = 0.02, coarse: float | None = None
-) -> Trace:
+    K_v: float, forward: float = 0.0, K_i_v: float = 0.0, tau_c: float = 0.02, coarse: float | None = None,
+    lead_s: float = 0.0,
+) -> Trace:  # fmt: skip
     """Answer of a position gain (and its integral part) on a PI speed loop that turns a shaft with friction.
 
     ``coarse``: angle of a count where the loop takes its speed from counts, as drives do.
@@ -52,11 +57,13 @@ def moves(
     K_i = 15.0 * K_p
     theta = omega = total = integral = asked = torque = shown = 0.0
     seen, current = [], []
-    for before, now in zip(np.concatenate([theta_ref[:1], theta_ref[:-1]]), theta_ref, strict=True):
+    faster = np.diff(theta_ref, 2, prepend=theta_ref[0], append=theta_ref[-1]) / T_S**2
+    pairs = zip(np.concatenate([theta_ref[:1], theta_ref[:-1]]), theta_ref, faster, strict=True)
+    for before, now, acceleration in pairs:
         last, shown = shown, round(theta / (coarse or COUNT)) * (coarse or COUNT)
         error = now - shown
         total += K_i_v * error * T_S
-        slip = K_v * error + total + forward * (now - before) / T_S
+        slip = K_v * error + total + forward * (now - before) / T_S + lead_s * acceleration
         slip -= (shown - last) / T_S if coarse else omega
         integral += K_i * slip * T_S
         asked = K_p * slip + integral
@@ -124,6 +131,20 @@ def test_counts_of_a_feed_forward_are_told_by_the_lag_that_they_leave(share: flo
     for seen in (0.0, 0.1):
         unsure = forward_scale(8.0, seen, 0.02, FORWARD)
         assert unsure.scale is None and "8 counts feed" in unsure.why
+
+
+@pytest.mark.parametrize("lead", [8e-3, 30e-3])
+def test_counts_of_an_acceleration_are_told_by_the_integral_of_the_lag(lead: float) -> None:
+    """An axis of a Copley lagged while it sped up: the unit of its 0x60FB:03 was not known."""
+    doubled = moves(15.0, lead_s=lead)
+    once_more = np.sort(np.concatenate([doubled.t_s, doubled.t_s + 0.2e-3]))  # a demand is shown twice
+    signals = {name: np.repeat(signal, 2) for name, signal in doubled.signals.items()}
+    found, std = led_s(Trace(once_more, signals, doubled.units), ramp_areas(moves(15.0)))
+    assert found == pytest.approx(lead, rel=LED_TOL) and std < 0.05 * lead
+    told = forward_scale(500.0, found, std, LEAD, "s")
+    assert told.scale == pytest.approx(lead / 500.0, rel=LED_TOL) and told.unit == "s"
+    unsure = forward_scale(8.0, 1e-3, 1e-3, LEAD, "s")
+    assert unsure.scale is None and "1 +-2 ms of the acceleration forward" in unsure.why
 
 
 def test_an_integral_part_of_the_position_is_refused() -> None:

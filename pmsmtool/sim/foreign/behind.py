@@ -124,8 +124,8 @@ class Behind:
         Of the session.
     set_up : SetUp
         The motor.
-    velocity_ff : float
-        Share of a move's speed that a cascade adds to its speed reference.
+    velocity_ff, acceleration_ff_s : float
+        Share of a move's speed that a cascade adds to its speed reference, and how many seconds of its acceleration.
     position_gains : PositionGains
         Of the position modes.
     largest_step : float
@@ -138,6 +138,7 @@ class Behind:
     set_up: SetUp
     largest_step: float = 0.0
     velocity_ff: float = 0.0
+    acceleration_ff_s: float = 0.0
     position_gains: PositionGains = field(init=False)
     _turns_off: int = field(default=0, init=False)
     _before_record: float | None = field(default=None, init=False)

@@ -35,6 +35,8 @@ POSITION_OBJECTS: tuple[tuple[Address, Address | None], ...] = (
     ((0x60FB, 1), (0x60FB, 2)),
 )
 """Position gain and feed-forward of the speed: Nanotec, ZeroErr, Copley; a controller of the position has neither."""
+ACCELERATION_OBJECT: Address = (0x60FB, 3)
+"""Acceleration that a Copley adds to the reference of its speed (CME 2 user guide, 11.7: position loop gains)."""
 CURRENT_OBJECTS: tuple[Address, Address] = ((0x60F6, 1), (0x60F6, 2))
 """Proportional and integral part of the current loops, of drives whose trace shows them at loop rate: Copley."""
 CURRENT_INTEGRAL_RATE = (0.5, 1.5)
@@ -46,7 +48,8 @@ INTEGRAL_RATE = (0.08, 0.35)
 POSITION_RATE = (0.15, 0.3)
 """Position gain over the bandwidth of the speed loop."""
 FORWARD = (0.0, 0.5, 1.0)
-"""Shares of the speed that are fed forward, where the drive has an object for it."""
+"""Shares of the speed that are fed forward, where the drive has an object for it, and of J / K_p of the acceleration.
+"""
 FILTER_HZ = (120.0, 1000.0)
 DECIMATION = (4, 20)
 CURRENT_BANDWIDTH = (0.08, 0.3)
@@ -93,6 +96,8 @@ class DrawnGains:
         What they hold at first.
     K_v_per_s, forward_share : float
         One count of either.
+    acceleration_counts, acceleration_ff_s : int, float
+        Of the object of the acceleration: what it holds at first, and one count (s); 0: none.
     current : DrawnGains or None
         Of the current loops, where the drive has objects of them and a trace: V/A, and V/(A s), 1/s or s.
     """
@@ -113,6 +118,8 @@ class DrawnGains:
     forward_counts: int = 0
     K_v_per_s: float = 0.0
     forward_share: float = 0.0
+    acceleration_counts: int = 0
+    acceleration_ff_s: float = 0.0
     current: DrawnGains | None = None
 
     def K_i_nm_per_rad(self, gain: float, integral: float) -> float:
@@ -139,6 +146,9 @@ class DrawnGains:
             yield Law(*self.position, SOURCE, set_up=self.position_counts, act=self._act_on_position)
         if self.forward is not None:
             yield Law(*self.forward, SOURCE, set_up=self.forward_counts, act=self._act_on_forward)
+        if self.acceleration_ff_s:
+            counts = self.acceleration_counts
+            yield Law(*ACCELERATION_OBJECT, SOURCE, set_up=counts, act=self._act_on_acceleration)
         kind = RMS if self.rms else 1.0
         own = dict.fromkeys(EPOS2_CURRENTS, 1.0) if (0x2027, 0) in laws else {}
         if (0x2333, 1) in laws:
@@ -167,6 +177,9 @@ class DrawnGains:
 
     def _act_on_forward(self, behind: Behind, counts: float) -> None:
         behind.velocity_ff = self.forward_share * counts
+
+    def _act_on_acceleration(self, behind: Behind, counts: float) -> None:
+        behind.acceleration_ff_s = self.acceleration_ff_s * counts
 
 
 def _scaled(law: Law, factor: float) -> Law:
@@ -229,10 +242,17 @@ def _with_position(drawn: DrawnGains, bandwidth: float, chance: random.Random, o
     if forward is None or not objects.has(forward):
         return replace(drawn, position=position, position_counts=counts, K_v_per_s=K_v)
     full = round(_between(chance, *_room(objects, forward)))
-    return replace(
+    drawn = replace(
         drawn, position=position, position_counts=counts, K_v_per_s=K_v, forward=forward,
         forward_counts=round(share * full), forward_share=1.0 / full,
     )  # fmt: skip
+    if not objects.has(ACCELERATION_OBJECT):
+        return drawn
+    own = random.Random(f"acceleration {drawn.counts} {counts}")  # what was drawn before this object stays
+    full = round(_between(own, *_room(objects, ACCELERATION_OBJECT)))
+    return replace(
+        drawn, acceleration_counts=round(own.choice(FORWARD) * full), acceleration_ff_s=1.0 / (bandwidth * full)
+    )
 
 
 def _room(objects: MakersObjects, address: Address) -> tuple[int, int]:

@@ -170,7 +170,8 @@ class ForeignDrive:
             if self.objects.has((index, sub)):
                 _pass_on(dictionary, dictionary.find(index, sub), entry)
         behind.tune_speed_loop()
-        if not PID_MARKS & set(self.laws):
+        drawn = self.gains is not None and self.gains.position is not None
+        if drawn or not PID_MARKS & set(self.laws):
             behind.position_gains.pid = None  # a position gain on the speed controller (assumed)
         for law in self.laws.values():
             _obey(law, dictionary.find(law.index, law.sub), behind)

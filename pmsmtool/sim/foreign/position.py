@@ -207,7 +207,8 @@ class PositionLoop:
             torque, gain, slip = K_P * error + self._derivative, K_I, error
         else:
             seen = TURN * (self._at - before) / self._T
-            slip = gains.K_v * error + TURN * speed * self.behind.velocity_ff - seen
+            ahead = speed * self.behind.velocity_ff + acceleration * self.behind.acceleration_ff_s
+            slip = gains.K_v * error + TURN * ahead - seen
             torque, gain = gains.K_p * slip, gains.K_i
         torque += TURN * (gains.inertia_ff * acceleration + gains.friction_ff * speed)
         most = self.behind.set_up.i_max_apk * self.behind.set_up.torque_constant
