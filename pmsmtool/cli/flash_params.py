@@ -62,7 +62,7 @@ def flash_fleet(
     motion: MotionOptions,
     out: Output,
     *,
-    store: bool,
+    store: bool | None,
     dry_run: bool,
     check: bool,
     serials: Path | None = None,
@@ -140,7 +140,7 @@ def _grouped(jobs: list[Download]) -> list[str]:
     ]
 
 
-def _results(jobs: list[Download], *, store: bool, to_the_end: bool) -> list[Outcome | Exception | None]:
+def _results(jobs: list[Download], *, store: bool | None, to_the_end: bool) -> list[Outcome | Exception | None]:
     """Run the downloads; None for one that was not begun after a failure."""
     results: list[Outcome | Exception | None] = []
     for job in jobs:
@@ -186,7 +186,7 @@ class _Unattended:
 
 
 def _ask(
-    lines: list[str], due: list[Download], bus: BusOptions, motion: MotionOptions, out: Output, *, store: bool
+    lines: list[str], due: list[Download], bus: BusOptions, motion: MotionOptions, out: Output, *, store: bool | None
 ) -> None:
     from pmsmtool.cli.consent import ask_writing, person_present
     from pmsmtool.errors import Declined
@@ -197,7 +197,7 @@ def _ask(
             likely="--yes of several drives needs the list of their serial numbers",
             hint="--yes --serials FILE, with a line `node serial` for each drive as `pmsmtool scan` shows them",
         )
-    after = [f"node {job.node.node}: {line}" for job in due for line in job.plan.after_lines(store=store)]
+    after = [f"node {job.node.node}: {line}" for job in due for line in job.plan.after_lines(store=store is not False)]
     serial = min(job.identity.serial for job in due)  # 0 where one of them tells none
     ask_writing([*lines, *after], motion, simulated=bus.simulated(), serial=serial, out=out)
 
@@ -212,7 +212,7 @@ def _refuse_serial(motion: MotionOptions) -> None:
         )  # fmt: skip
 
 
-def _run(job: Download, *, store: bool) -> Outcome | Exception:
+def _run(job: Download, *, store: bool | None) -> Outcome | Exception:
     from pmsmtool.errors import Interrupted, PmsmtoolError
 
     try:
@@ -230,8 +230,7 @@ def _row(job: Download, result: Outcome | Exception | None) -> tuple[Any, ...]:
     if isinstance(result, Exception):
         return node, serial, f"FAIL {getattr(result, 'what', result)}".splitlines()[0], "-", "-", "-", "-"
     crc = "-" if result.crc is None else f"{result.crc:#010x}"
-    kept = "PASS stored" if result.stored else "PASS until reset"
-    return node, serial, kept, result.written, result.equal, crc, result.retries
+    return node, serial, f"PASS {result.kept}", result.written, result.equal, crc, result.retries
 
 
 def _prefixed(out: Output, node_id: int) -> Any:
@@ -255,7 +254,8 @@ def _prefixed(out: Output, node_id: int) -> Any:
               "SERIAL per drive.")  # fmt: skip
 @click.option("--canary", type=DIR, metavar="RUN_DIR", help="Run of a drive "
               "of this kind that passed `prove` with this set; needed by --serials.  [default: SOURCE]")  # fmt: skip
-@click.option("--no-store", is_flag=True, help="Let it act until the next reset only.")
+@click.option("--store/--no-store", default=None, help="Store it even where nothing changes; or let it act until the "
+              "next reset only.  [default: store what is written]")  # fmt: skip
 @map_option
 @bus_options
 @write_options
@@ -267,7 +267,7 @@ def flash_params_command(
     source: Path,
     dry_run: bool,
     check: bool,
-    no_store: bool,
+    store: bool | None,
     nodes: tuple[int, ...] | None,
     serials: Path | None,
     canary: Path | None,
@@ -275,9 +275,10 @@ def flash_params_command(
 ) -> None:
     """Write a parameter set, a design, a DCF or a run's parameters to the drive and store it.
 
-    Only what differs is written. Before the first write the old contents are in a journal; everything is read back,
-    activated together, stored, and compared again after a reset. Whatever fails, the old set comes back; after a power
-    cut or a killed tool, the same command or `pmsmtool restore` finishes.
+    Only what differs is written; where nothing does, nothing is stored either, and there is no reset. Before the first
+    write the old contents are in a journal; everything is read back, activated together, stored, and compared again
+    after a reset. Whatever fails, the old set comes back; after a power cut or a killed tool, the same command or
+    `pmsmtool restore` finishes.
     """
     from pmsmtool.cli.flash_session import carry_out
     from pmsmtool.commissioning.parameter_source import load_parameters
@@ -297,12 +298,12 @@ def flash_params_command(
         wanted = load_parameters(source, drive_map)
     if nodes is not None:
         flash_fleet(
-            nodes, wanted, drive_map, bus, motion, out, store=not no_store, dry_run=dry_run, check=check,
+            nodes, wanted, drive_map, bus, motion, out, store=store, dry_run=dry_run, check=check,
             serials=serials, canary=canary or (source if source.is_dir() else None),
         )  # fmt: skip
         return
     with set_named() as jobs, open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
         carry_out(
             node, jobs, wanted, bus, motion, out,
-            command="flash-params", store=not no_store, dry_run=dry_run, check=check,
+            command="flash-params", store=store, dry_run=dry_run, check=check,
         )  # fmt: skip

@@ -29,7 +29,7 @@ def carry_out(
     out: Output,
     *,
     command: str,
-    store: bool = True,
+    store: bool | None = None,
     dry_run: bool = False,
     check: bool = False,
 ) -> None:
@@ -67,7 +67,7 @@ def write_plan(
     motion: MotionOptions,
     out: Output,
     *,
-    store: bool = True,
+    store: bool | None = None,
     restoring: bool = False,
 ) -> Outcome:
     """Ask for the consent to a plan and carry it out."""
@@ -83,7 +83,7 @@ def write_plan(
     job.admit(store=store)  # nobody is asked for what would be refused after his consent
     node.sdo.finish_within(math.inf)  # a person may take his time, and a download has limits of its own
     if job.has_work(store=store):
-        lines = [*plan.lines(), *plan.after_lines(store=store)]
+        lines = [*plan.lines(), *plan.after_lines(store=store is not False)]
         ask_writing(lines, motion, simulated=bus.simulated(), serial=identity.serial, out=out)
     return job.run(store=store, restoring=restoring)
 
@@ -105,10 +105,9 @@ def checked_identity(node: DriveNode, out: Output) -> Identity:
 
 def told(outcome: Outcome, node: DriveNode) -> str:
     """Return the outcome of a download in one line."""
-    kept = "stored" if outcome.stored else "active until the next reset"
     crc = "" if outcome.crc is None else f", CRC-32 {outcome.crc:#010x}"
     retries = f", {counted(outcome.retries, 'transfer')} repeated" if outcome.retries else ""
-    return f"node {node.node}  {outcome.written} written, {outcome.equal} held already, {kept}{crc}{retries}"
+    return f"node {node.node}  {outcome.written} written, {outcome.equal} held already, {outcome.kept}{crc}{retries}"
 
 
 def plan_facts(plan: Plan) -> dict[str, Any]:

@@ -99,14 +99,10 @@ def restore_command(
             out.result("restore", {"identity": identity, **plan_facts(plan)}, plan.lines())
             return
         if not plan.changes and snapshot.state != "open":
-            outcome = nothing_written(node, plan)
+            outcome = nothing_written(node, plan, folder)
             same = "the file states" if snapshot_file is not None else "before its last download"
             text = f"{told(outcome, node)}: already as {same}, nothing was done"
             out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [text])
-            if not outcome.stored:
-                out.warn(
-                    "whether the drive keeps these values over a reset is not known: look again after its next reset"
-                )
             return
         keeps = not is_whole(snapshot) or node.has(*STORE_ALL)
         outcome = write_plan(

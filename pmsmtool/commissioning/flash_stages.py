@@ -42,9 +42,10 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
         download = Download(drive.node, drive.identity, plan, marks, folder, say=say)
         jobs.append(download)
         firmware = [line for line in (unknown_firmware(drive.node.map, drive.identity),) if line]
-        if not plan.changes and not drive.node.map.staging:
+        work = download.has_work()
+        if not (work or drive.node.map.staging):
             return _held_already(plan, firmware)
-        if download.has_work(store=True):
+        if work:
             consent(
                 [
                     *firmware,
@@ -57,7 +58,7 @@ def flash_stage(run: RunDirectory, drive: CanopenDrive, consent: Consent, say: S
     total = len(plan.entries)
     criteria = [
         Acceptance("objects read back as written, after a reset", f"{total} of {total}", "all", True),
-        Acceptance("the set is stored", "yes" if outcome.stored else "no", "yes", outcome.stored),
+        Acceptance("the set is stored", "yes" if outcome.stored else "no", "yes", outcome.stored is True),
     ]
     values = [_change(change) for change in plan.changes]
     good = all(line.ok for line in criteria)

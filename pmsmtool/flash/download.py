@@ -21,7 +21,7 @@ from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import STORE_TIMEOUT_S, DriveNode, state_text
 from pmsmtool.drive.interruption import interrupts_deferred
-from pmsmtool.drive.parameters import Progress
+from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.errors import (
     DriveTimeout,
@@ -32,7 +32,7 @@ from pmsmtool.errors import (
     SdoAbort,
     VerifyMismatch,
 )
-from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot, State
+from pmsmtool.flash.journal import MARKS, DamagedSnapshot, Entry, JournalFolder, Snapshot, State
 from pmsmtool.flash.map_gate import check_map, remember_map
 from pmsmtool.flash.plan import Change, Plan, differences
 from pmsmtool.flash.whole_drive import WholeDrive, parameters_of
@@ -64,8 +64,8 @@ class Outcome:
     ----------
     written, equal : int
         Objects written, objects that held their value already.
-    stored : bool
-        Whether the drive keeps the set over a reset, as seen after one.
+    stored : bool or None
+        Whether the drive keeps the set over a reset, as seen after one; None where nothing shows it.
     crc : int or None
         CRC-32 of the drive's whole set; None where it has none.
     retries : int
@@ -78,11 +78,18 @@ class Outcome:
 
     written: int
     equal: int
-    stored: bool
+    stored: bool | None
     crc: int | None
     retries: int
     starts: int
     refused: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def kept(self) -> str:
+        """How long the drive keeps the set."""
+        if self.stored is None:
+            return "nothing stored, no reset; whether it is stored is not known, `flash-params --store` stores it"
+        return "stored" if self.stored else "active until the next reset"
 
 
 class Download:
@@ -144,13 +151,14 @@ class Download:
     def _unknown(self) -> str:
         return f"which set the drive holds is not known, `pmsmtool restore -n {self.node.node}` brings the old one back"
 
-    def run(self, *, store: bool = True, restoring: bool = False) -> Outcome:
+    def run(self, *, store: bool | None = None, restoring: bool = False) -> Outcome:
         """Carry the plan out.
 
         Parameters
         ----------
-        store : bool
-            Also keep it in non-volatile memory; otherwise it acts until the next reset.
+        store : bool, optional
+            Keep it in non-volatile memory: always, or never, so that it acts until the next reset; not given: what is
+            written, and what is known to wait for storing.
         restoring : bool
             The plan brings the last journal's old contents back: that journal is kept, no new one begun, so that
             what counts as old stays the same however often it is brought back.
@@ -167,8 +175,10 @@ class Download:
         if (aside := self.folder.set_aside_damaged()) is not None:
             self._say(f"the last journal was damaged, is kept as {aside}; what the drive held before is not known")
         if not self.has_work(store=store):
+            kept = stored(self.node, self.plan, self.folder)
             self._close_stale(restoring)
-            return self._outcome(0, starts=1, stored=self._was_stored)
+            return self._outcome(0, starts=1, stored=kept)
+        store = store is not False
         with contextlib.ExitStack() as hold:
             # An interrupt leaves no journal behind that nobody closes: from here on it is answered by the roll-back.
             noted = hold.enter_context(interrupts_deferred())
@@ -192,7 +202,7 @@ class Download:
                     what = reset.what
                 except BaseException as error:
                     raise self._roll_back(error, journal) from error
-            self.folder.close(journal, "restored" if restoring else "done")
+            self.folder.close(journal, "restored" if restoring else "done", stored=store)
             reached = "the set that was to be restored" if restoring else "the new set"
             self._holds = f"the drive holds {reached}, {'stored and read back' if store else 'until its next reset'}"
             outcome = self._outcome(len(self.plan.changes), starts=starts, stored=store)
@@ -202,16 +212,18 @@ class Download:
 
     # ---- before ---------------------------------------------------------------------------------
 
-    def has_work(self, *, store: bool = True) -> bool:
-        """Whether anything would be written, marks and storing included; only reads the drive."""
+    def has_work(self, *, store: bool | None = None) -> bool:
+        """Whether anything would be written, marks and storing included; only reads the drive. ``store`` as of run."""
         self._old_marks = self._read_marks()
         self._was_stored = self._parameters.is_stored()
         self._crc_before = self._parameters.crc_active if self.node.map.staging else None
         self._stored_before = self._stored_crc()
-        same_marks = self._old_marks.get("design_id") == self._wanted_marks.get("design_id")
-        return bool(self.plan.changes) or not same_marks or (store and not self._was_stored)
+        marks = "design_id" in self._old_marks and self._old_marks["design_id"] != self._wanted_marks.get("design_id")
+        waits = store is not False and stored(self.node, self.plan, self.folder) is False
+        asked = store is True and not self.node.map.staging
+        return bool(self.plan.changes) or marks or waits or asked
 
-    def admit(self, *, store: bool = True) -> None:
+    def admit(self, *, store: bool | None = None) -> None:
         """Refuse what no consent would allow: a map that is not this drive's, a drive that may move; only reads.
 
         Raises ConfigError, SafetyRefusal: as ``flash.map_gate.check_map`` and :func:`refuse_while_enabled`;
@@ -219,7 +231,7 @@ class Download:
 
         Parameters
         ----------
-        store : bool
+        store : bool, optional
             As of :meth:`run`.
         """
         check_map(self.node.map, self.identity, self.folder)
@@ -229,14 +241,14 @@ class Download:
                 where=f"node {self.node.node}",
                 hint="enter the values with the maker's software, or write the rows of your manual into a map",
             )
-        if store and not self.node.can_store():
+        if store is not False and self.has_work(store=store) and not self.node.can_store():
             raise NotAvailable(
                 NO_STORE, where=f"node {self.node.node}",
                 hint="`flash-params --no-store` lets the set act until then; nothing was written",
             )  # fmt: skip
         refuse_while_enabled(self.node)
 
-    def _gate(self, store: bool) -> None:
+    def _gate(self, store: bool | None) -> None:
         check_identity(self.node, self.identity)
         self.admit(store=store)
         self._parameters.check_layout()
@@ -450,13 +462,26 @@ class Download:
             f"run the same command, or `pmsmtool restore -n {self.node.node}`"
         )
 
-    def _outcome(self, written: int, *, starts: int, stored: bool) -> Outcome:
+    def _outcome(self, written: int, *, starts: int, stored: bool | None) -> Outcome:
         crc = self._parameters.crc_active if self.node.map.staging else None
         whole = self._parameters
         refused = dict(whole.refused) if isinstance(whole, WholeDrive) else {}
         equal = len(self.plan.entries) - written
         written -= len(refused)
         return Outcome(written, equal, stored, crc, self.node.sdo.retries, starts, refused)
+
+
+def stored(node: DriveNode, plan: Plan, folder: JournalFolder) -> bool | None:
+    """Return whether a drive keeps over a reset what it holds of a plan; of other makers' its last journal may show it.
+
+    None: nothing shows it.
+    """
+    if node.map.staging:
+        return DriveParameters(node).is_stored()
+    with contextlib.suppress(DamagedSnapshot):
+        if (last := folder.last()) is not None:
+            return last.shows_stored({(entry.index, entry.sub): entry.old for entry in plan.entries})
+    return None
 
 
 @contextlib.contextmanager

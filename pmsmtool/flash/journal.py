@@ -14,7 +14,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -80,6 +80,8 @@ class Snapshot:
         Content hash of the set that was written; empty in a backup.
     entries : tuple of Entry
         Parameters in writing order, then the marks.
+    stored : bool
+        Whether that download stored what it wrote, or brought back, and saw it after a reset.
     current_limit_apk : float or None
         Smallest limit of the current that the drive held (A peak); None where none of known unit was seen.
     """
@@ -91,10 +93,21 @@ class Snapshot:
     content: str
     entries: tuple[Entry, ...]
     current_limit_apk: float | None = None
+    stored: bool = False
 
-    def with_state(self, state: State) -> Snapshot:
-        """Return the snapshot in another state."""
-        return replace(self, state=state)
+    def shows_stored(self, held: Mapping[tuple[int, int], bytes]) -> bool | None:
+        """Return whether a drive keeps over a reset what it holds, by its last journal; None: that does not show it.
+
+        ``held``: contents by index and sub-index.
+        """
+        if self.state == "open":
+            return False
+        left = {(e.index, e.sub): (e.new if self.state == "done" else e.old) for e in self.entries}
+        if self.stored:
+            return True if held and held.items() <= left.items() else None
+        changed = {(e.index, e.sub) for e in self.entries if e.new != e.old}
+        unsaved = self.state == "done" and any(held[key] == left[key] for key in changed & held.keys())
+        return False if unsaved else None
 
     def dumps(self) -> str:
         """Return the file's text."""
@@ -118,6 +131,7 @@ class Snapshot:
             "signature": self.signature,
             "content": self.content,
             **({} if self.current_limit_apk is None else {"current_limit_apk": self.current_limit_apk}),
+            **({"stored": True} if self.stored else {}),
             "entries": entries,
         }
 
@@ -159,7 +173,7 @@ def parse_snapshot(text: str, where: str) -> Snapshot:
         raise DamagedSnapshot("not a snapshot", where=where, violations=wrong)
     return Snapshot(
         head["kind"], head["state"], Identity(node=head["node"], **who), head["signature"], head["content"], entries,
-        head.get("current_limit_apk"),
+        head.get("current_limit_apk"), head.get("stored", False),
     )  # fmt: skip
 
 
@@ -202,6 +216,7 @@ _HEAD: tuple[Key, ...] = (
     _whole("signature", _WORD, "layout of its parameter set"),
     _required("content", "content hash of the set"),
     Key("", "current_limit_apk", "float", "A", 0, math.inf, None, "smallest limit of the current"),
+    Key("", "stored", "bool", "", 0, 0, None, "the set was stored"),
 )
 _IDENTITY: tuple[Key, ...] = (
     *(_whole(name, _WORD, "object 0x1018") for name in ("vendor", "product", "revision")),
@@ -295,9 +310,9 @@ class JournalFolder:
         self._forget_note()
         return snapshot
 
-    def close(self, snapshot: Snapshot, state: State) -> None:
+    def close(self, snapshot: Snapshot, state: State, *, stored: bool = False) -> None:
         """Note that the drive holds the new set (``done``), the old one again (``restored``), or neither (``open``)."""
-        write_snapshot(self.path, snapshot.with_state(state))
+        write_snapshot(self.path, replace(snapshot, state=state, stored=stored))
 
     def _archive(self, snapshot: Snapshot) -> None:
         text = snapshot.dumps()

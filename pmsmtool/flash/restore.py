@@ -15,7 +15,7 @@ from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import DriveMap, address_in
 from pmsmtool.errors import ConfigError, NotAvailable, Partial, SafetyRefusal, SdoAbort
-from pmsmtool.flash.download import Outcome
+from pmsmtool.flash.download import Outcome, stored
 from pmsmtool.flash.journal import MARKS, Entry, JournalFolder, Snapshot
 from pmsmtool.flash.map_gate import map_on
 from pmsmtool.flash.plan import Change, Plan, make_plan, names_to_read
@@ -233,11 +233,10 @@ def due_of_journal(snapshot: Snapshot, plan: Plan, folder: JournalFolder) -> Pla
     )
 
 
-def nothing_written(node: DriveNode, plan: Plan) -> Outcome:
+def nothing_written(node: DriveNode, plan: Plan, folder: JournalFolder) -> Outcome:
     """Return the outcome of a plan without a change that is left alone; the drive is only read."""
-    parameters = DriveParameters(node)
-    crc = parameters.crc_active if node.map.staging else None
-    return Outcome(0, len(plan.entries), parameters.is_stored(), crc, node.sdo.retries, 0)
+    crc = DriveParameters(node).crc_active if node.map.staging else None
+    return Outcome(0, len(plan.entries), stored(node, plan, folder), crc, node.sdo.retries, 0)
 
 
 def names_of(snapshot: Snapshot) -> tuple[str, ...]:

@@ -226,6 +226,6 @@ def test_a_journal_is_due_where_the_drive_holds_what_it_wrote(
     plan = Plan((change,), {}, "")
     if due is None:
         with pytest.raises(SafetyRefusal, match="neither its old nor its new set"):
-            due_of_journal(SNAPSHOT.with_state(state), plan, folder)
+            due_of_journal(replace(SNAPSHOT, state=state), plan, folder)
     else:
-        assert len(due_of_journal(SNAPSHOT.with_state(state), plan, folder).entries) == due
+        assert len(due_of_journal(replace(SNAPSHOT, state=state), plan, folder).entries) == due

@@ -17,11 +17,13 @@ from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connect import connect
 from pmsmtool.cli.main import cli
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, Interrupted, Partial
 from pmsmtool.flash.download import Download
-from pmsmtool.flash.journal import JournalFolder, read_snapshot
-from pmsmtool.flash.restore import check_snapshot, old_marks, plan_restore
+from pmsmtool.flash.journal import JournalFolder, Snapshot, read_snapshot
+from pmsmtool.flash.restore import check_snapshot, old_marks, plan_download, plan_restore
 from pmsmtool.flash.whole_drive import (
     Listed,
     WholeDrive,
@@ -32,6 +34,7 @@ from pmsmtool.flash.whole_drive import (
     take_whole_backup,
     whole_map,
 )
+from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.node.dictionary import Refused
 from pmsmtool.sim.node.node import Node
 from tests.foreign.data_sheets import Row, epos4, write_eds
@@ -281,3 +284,35 @@ def test_a_drive_that_cannot_store_says_so(tmp_path: Path, monkeypatch: pytest.M
     assert isinstance(error.exception, Partial) and "cannot store all (0x1010:01)" in str(error.exception)
     count = len(saved.entries)
     assert f"{count} of {count} objects are as saved" in str(error.exception)
+
+
+def test_a_set_that_the_drive_holds_is_stored_only_where_it_waits_for_that(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every download to another maker's drive ended with a store and a reset, also where nothing changed."""
+    with opened(write_eds(tmp_path / "x.eds", (*epos4(), *STORE))) as node:
+        node.map = load_family("epos4")
+        identity, done = node.identity(), cast(list[str], [])
+        store, reset = node.store, node.reset
+        monkeypatch.setattr(node, "store", lambda: (done.append("store"), store()))
+        monkeypatch.setattr(node, "reset", lambda: (done.append("reset"), reset()))
+        held = node.map.decode(DriveParameters(node).read(("motor.pole_pairs",))).values
+        wanted = ParameterSet({"motor.pole_pairs": held["motor.pole_pairs"] + 1})
+
+        def flashed(values: ParameterSet, store: bool | None = None) -> tuple[int, bool | None, list[str]]:
+            done.clear()
+            plan = plan_download(node, values)
+            outcome = Download(node, identity, plan, {}, JournalFolder(identity, tmp_path)).run(store=store)
+            return outcome.written, outcome.stored, list(done)
+
+        both = ["store", "reset"]
+        assert flashed(ParameterSet(held)) == (0, None, []), "the maker's software may have stored it or not"
+        assert flashed(ParameterSet(held), store=True) == (0, True, both)
+        assert flashed(wanted, store=False) == (1, False, [])
+        assert flashed(wanted, store=False) == (0, False, [])
+        assert flashed(wanted) == (0, True, both), "it was in the RAM only"
+        assert flashed(wanted) == (0, True, []) == flashed(wanted, store=False)
+        assert flashed(wanted, store=True) == (0, True, both)
+        folder = JournalFolder(identity, tmp_path)
+        folder.close(cast(Snapshot, folder.last()), "open")
+        assert flashed(wanted) == (0, True, both), "an interrupted download may have left it in the RAM"
