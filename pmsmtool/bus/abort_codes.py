@@ -54,12 +54,13 @@ BUSY_CODES = frozenset({AbortCode.RESOURCE, AbortCode.LOCAL_CONTROL, AbortCode.D
 """What drives answer while they store, start, or are asked too much: the same request may pass a moment later."""
 
 _MANUAL = "look the object up in the drive's manual or EDS; `pmsmtool info` names drive and firmware"
+_LIMITS = "`pmsmtool param help NAME` shows the limits; another maker's: `pmsmtool export csv SET --map ITS.eds`"
 _LIKELY: dict[int, tuple[str, str]] = {
     AbortCode.NO_OBJECT: ("the drive's firmware does not have this object", "compare `pmsmtool info` with the map"),
     AbortCode.NO_SUBINDEX: ("the drive's firmware does not have this object", "compare `pmsmtool info` with the map"),
-    AbortCode.VALUE_HIGH: ("the value is above the drive's limit", "`pmsmtool param help NAME` shows the limits"),
-    AbortCode.VALUE_LOW: ("the value is below the drive's limit", "`pmsmtool param help NAME` shows the limits"),
-    AbortCode.VALUE: ("the value is outside what the drive accepts", "`pmsmtool param help NAME` shows the limits"),
+    AbortCode.VALUE_HIGH: ("the value is above the drive's limit", _LIMITS),
+    AbortCode.VALUE_LOW: ("the value is below the drive's limit", _LIMITS),
+    AbortCode.VALUE: ("the value is outside what the drive accepts", _LIMITS),
     AbortCode.DEVICE_STATE: (
         "the drive takes it in another state only: disabled, enabled, or without a fault",
         "`pmsmtool stop`, then `pmsmtool fault show`",

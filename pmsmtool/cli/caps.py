@@ -57,7 +57,11 @@ def caps_command(bus: BusOptions, out: Output, machine: Path | None, map_file: P
         assumed = assumptions_of(eds, None if machine is None else load_machine_file(machine))
     with open_node(bus, within_s=LOOKING_S) as node:
         found = examine(node, given, may_try=eds is not None)
-    out.result("caps", _facts(found), lambda: _lines(found, out.verbosity > 0, asked=eds is None))
+    refused = {} if machine is None or eds is None or not found.map_is_drives else _refused(machine, eds, found)
+    facts = {**_facts(found), **({"refused": refused} if machine is not None else {})}
+    out.result("caps", facts, lambda: _lines(found, out.verbosity > 0, asked=eds is None))
+    for name, why in refused.items():
+        out.warn(f"of the design of {machine} this drive refuses {name}: {why}")
     for name, why in found.drive_map.not_written(BY_NAME).items():
         if name not in found.drive_map.left_out:
             out.detail(f"not written: {name}: {why}")
@@ -75,6 +79,15 @@ def caps_command(bus: BusOptions, out: Output, machine: Path | None, map_file: P
         out.warn(f"{doubt}: {found.drive_map.name} was used, and nothing is written through it")
     elif firmware := unknown_firmware(found.drive_map, found.identity):
         out.warn(firmware)
+
+
+def _refused(machine: Path, eds: str, found: Capabilities) -> dict[str, str]:
+    from pmsmtool.commissioning.axis_design import refused_by_limits
+    from pmsmtool.machine.machine_file import load_machine_file
+    from pmsmtool.sim.foreign.file_rows import read_makers_objects
+
+    limits = {at: row.bounds for at, row in read_makers_objects(eds).rows.items()}
+    return refused_by_limits(load_machine_file(machine), found.drive_map, limits)
 
 
 def _facts(found: Capabilities) -> dict[str, Any]:

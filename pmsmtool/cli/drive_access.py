@@ -17,7 +17,7 @@ import click
 from pmsmtool.cli.options import DIR, FILE, SIMULATED_INTERFACE, BusOptions
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import BusError, ConfigError
-from pmsmtool.files import read_text, refuse_existing
+from pmsmtool.files import read_bytes, read_text, refuse_existing
 from pmsmtool.plain_text import counted
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ OWN_FAMILY = "pmsmsim"
 
 def map_option(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add ``--map`` to a command, which receives ``map_file: Path | None``."""
-    text = "Map of the drive's objects: TOML file, or family (`firmware-params`)."
+    text = "Map of the drive's objects: TOML file, family (`firmware-params`), or its EDS."
     return click.option("--map", "map_file", type=FILE, metavar="FILE", help=text)(function)
 
 
@@ -75,6 +75,8 @@ def read_map(path: Path | None) -> DriveMap:
     """Return the drive map of a file or a shipped family, the reference drive's without one."""
     from pmsmtool.drive_maps.drive_map import reference_map
     from pmsmtool.drive_maps.drive_map_file import parse_drive_map
+    from pmsmtool.drive_maps.eds import parse_eds
+    from pmsmtool.drive_maps.sheet_check import map_of_sheet
     from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 
     if path is None:
@@ -82,6 +84,8 @@ def read_map(path: Path | None) -> DriveMap:
     if not path.is_file() and (str(path) in family_names() or (path.name == str(path) and not path.suffix)):
         return load_family(str(path))
     hint = "give a map file in UTF-8 that you may read, or the name of a shipped family"
+    if path.suffix.lower() in (".eds", ".dcf"):
+        return map_of_sheet(parse_eds(read_bytes(path, hint=hint), str(path)))
     return parse_drive_map(read_text(path, hint=hint), str(path))
 
 

@@ -57,12 +57,14 @@ def _written(command: Callable[..., bytes | str]) -> Callable[..., None]:
     return write
 
 
-def _parameters(design: Path, drive_map: DriveMap, out: Output) -> ParameterSet:
-    """Read the set and say what the drive has no object for."""
+def _parameters(design: Path, drive_map: DriveMap, out: Output, *, partly: bool = False) -> ParameterSet:
+    """Read the set and say what the drive has no object for, and with ``partly`` what its object does not hold."""
     from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.flash.plan import without_assumed
 
     wanted, kept = without_assumed(drive_map, load_parameters(design, drive_map))
+    if partly:
+        drive_map = drive_map.without(drive_map.refused(wanted))
     missing = drive_map.missing(wanted)
     made_on = _map_of_run(design)
     if drive_map.staging and made_on not in ("", drive_map.name):
@@ -217,7 +219,7 @@ def csv_command(design: Path, map_file: Path | None, out: Output) -> str:
     from pmsmtool.commissioning.export import csv_text
 
     drive_map = read_map(map_file)
-    return csv_text(_parameters(design, drive_map, out), drive_map=drive_map)
+    return csv_text(_parameters(design, drive_map, out, partly=True), drive_map=drive_map)
 
 
 @export_command.command("params", epilog=examples("pmsmtool export params design.toml -o params.toml"))

@@ -73,11 +73,11 @@ def flash_fleet(
     With a person at the terminal a failure on one does not spare the others. With ``serials`` nobody is asked: the
     checks of ``flash.unattended`` take the place of the person, and the first failure ends it.
     """
-    from pmsmtool.cli.flash_session import checked_identity, plan_facts
+    from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.errors import CheckFailed, PmsmtoolError
-    from pmsmtool.flash.download import Download, set_named
+    from pmsmtool.flash.download import Download, run_all, set_named
     from pmsmtool.flash.journal import JournalFolder
     from pmsmtool.flash.map_gate import check_nodes
     from pmsmtool.flash.restore import marks_of, plan_download, tell_lacking
@@ -97,7 +97,7 @@ def flash_fleet(
             plan = plan_download(node, wanted)
             marks = marks_of(plan.content, datetime.datetime.now())
             jobs.append(Download(node, identity, plan, marks, folder, say=_prefixed(out, node_id)))
-        plans = {str(job.node.node): plan_facts(job.plan) for job in jobs}
+        plans = {str(job.node.node): job.plan.facts() for job in jobs}
         lines = _grouped(jobs)
         if dry_run or check:
             out.result("flash-params", {"nodes": plans}, lines)
@@ -117,7 +117,7 @@ def flash_fleet(
             alone.check(jobs, due, motion, out, lines)
         elif due:
             _ask(lines, due, bus, motion, out, store=store)
-        results = _results(jobs, store=store, to_the_end=alone is None)
+        results = run_all(jobs, store=store, to_the_end=alone is None)
     rows = [_row(job, result) for job, result in zip(jobs, results, strict=True)]
     heads = ("node", "serial", "result", "written", "held already", "CRC-32", "repeated")
     facts = {"nodes": plans, "results": [dict(zip(heads, row, strict=True)) for row in rows]}
@@ -138,15 +138,6 @@ def _grouped(jobs: list[Download]) -> list[str]:
         for text, of in lists.items()
         for line in (", ".join(f"node {job.node.node} (serial {job.identity.serial})" for job in of) + ":", *text)
     ]
-
-
-def _results(jobs: list[Download], *, store: bool | None, to_the_end: bool) -> list[Outcome | Exception | None]:
-    """Run the downloads; None for one that was not begun after a failure."""
-    results: list[Outcome | Exception | None] = []
-    for job in jobs:
-        stopped = not to_the_end and any(isinstance(result, Exception) for result in results)
-        results.append(None if stopped else _run(job, store=store))
-    return results
 
 
 class _Unattended:
@@ -210,17 +201,6 @@ def _refuse_serial(motion: MotionOptions) -> None:
             "--serial names one drive", where="--nodes",
             hint="answer the prompt, or list all drives: --yes --serials FILE",
         )  # fmt: skip
-
-
-def _run(job: Download, *, store: bool | None) -> Outcome | Exception:
-    from pmsmtool.errors import Interrupted, PmsmtoolError
-
-    try:
-        return job.run(store=store)
-    except Interrupted:
-        raise
-    except PmsmtoolError as error:
-        return error
 
 
 def _row(job: Download, result: Outcome | Exception | None) -> tuple[Any, ...]:

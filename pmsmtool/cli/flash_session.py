@@ -6,7 +6,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pmsmtool.cli.options import BusOptions, MotionOptions
 from pmsmtool.cli.output import Output
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.drive.port import Identity
     from pmsmtool.flash.download import Download, Outcome
-    from pmsmtool.flash.plan import Change, Plan
+    from pmsmtool.flash.plan import Plan
     from pmsmtool.params.parameter_set import ParameterSet
 
 
@@ -43,7 +43,7 @@ def carry_out(
     with contextlib.nullcontext() if looking else JournalFolder(identity).preparing():
         plan = plan_download(node, wanted)
         if looking:
-            out.result(command, {"identity": identity, **plan_facts(plan)}, plan.lines())
+            out.result(command, {"identity": identity, **plan.facts()}, plan.lines())
             if check and plan.changes:
                 raise CheckFailed(
                     f"the drive differs in {counted(len(plan.changes), 'object')}",
@@ -53,7 +53,7 @@ def carry_out(
             return
         marks = marks_of(plan.content, datetime.datetime.now())
         outcome = write_plan(node, jobs, identity, plan, marks, bus, motion, out, store=store)
-        out.result(command, {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])
+        out.result(command, {"identity": identity, **plan.facts(), "outcome": outcome}, [told(outcome, node)])
         tell_lacking(node, plan)
 
 
@@ -108,27 +108,3 @@ def told(outcome: Outcome, node: DriveNode) -> str:
     crc = "" if outcome.crc is None else f", CRC-32 {outcome.crc:#010x}"
     retries = f", {counted(outcome.retries, 'transfer')} repeated" if outcome.retries else ""
     return f"node {node.node}  {outcome.written} written, {outcome.equal} held already, {outcome.kept}{crc}{retries}"
-
-
-def plan_facts(plan: Plan) -> dict[str, Any]:
-    """Return a plan for ``--json``."""
-    return {
-        "content": plan.content,
-        "changes": [_change_facts(change) for change in plan.changes],
-        "equal": len(plan.entries) - len(plan.changes),
-        "missing": plan.missing,
-        "not_written": plan.not_written,
-    }
-
-
-def _change_facts(change: Change) -> dict[str, Any]:
-    return {
-        "name": change.name,
-        "object": change.where,
-        "old": change.old_value,
-        "wanted": change.wanted,
-        "held": change.held,
-        "unit": change.unit,
-        "old_bytes": change.old.hex(),
-        "new_bytes": change.new.hex(),
-    }

@@ -171,6 +171,8 @@ def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, 
             sets = [held if side == "device" else _side(side, drive_map) for side in (old, new)]
     else:
         sets = [_side(side, drive_map) for side in (old, new)]
+    for given in sets:
+        drive_map = drive_map.without(drive_map.refused(given))
     first, second = (drive_map.quantised(given) for given in sets)
     differences = compare(first, second, common_only=True)
     lacking = drive_map.not_written(dict.fromkeys(name for side in sets for name in (*side.values, *side.tables)))

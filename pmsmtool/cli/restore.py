@@ -52,7 +52,7 @@ def restore_command(
     A backup by --eds needs no map. Objects that the drive refuses are named, and the exit code is 10; all others are
     brought back. Identifiers that follow the node id are those of this drive.
     """
-    from pmsmtool.cli.flash_session import checked_identity, plan_facts, told, write_plan
+    from pmsmtool.cli.flash_session import checked_identity, told, write_plan
     from pmsmtool.drive.objects import STORE_ALL
     from pmsmtool.drive_maps.shipped_maps import family_of
     from pmsmtool.errors import ConfigError, Partial
@@ -96,20 +96,20 @@ def restore_command(
             out.note(f"`pmsmtool restore {folder.path}` undoes the download before that one")
             plan = due
         if dry_run:
-            out.result("restore", {"identity": identity, **plan_facts(plan)}, plan.lines())
+            out.result("restore", {"identity": identity, **plan.facts()}, plan.lines())
             return
         if not plan.changes and snapshot.state != "open":
             outcome = nothing_written(node, plan, folder)
             same = "the file states" if snapshot_file is not None else "before its last download"
             text = f"{told(outcome, node)}: already as {same}, nothing was done"
-            out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [text])
+            out.result("restore", {"identity": identity, **plan.facts(), "outcome": outcome}, [text])
             return
         keeps = not is_whole(snapshot) or node.has(*STORE_ALL)
         outcome = write_plan(
             node, jobs, identity, plan, old_marks(snapshot), bus, motion, out,
             restoring=snapshot_file is None, store=keeps,
         )  # fmt: skip
-        out.result("restore", {"identity": identity, **plan_facts(plan), "outcome": outcome}, [told(outcome, node)])
+        out.result("restore", {"identity": identity, **plan.facts(), "outcome": outcome}, [told(outcome, node)])
         missed = [f"not restored: {name}: {reason}" for name, reason in outcome.refused.items()]
         if not keeps:
             missed.append("not stored: the drive cannot store all (0x1010:01); it holds them until its next reset")

@@ -30,7 +30,7 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
 
     Bytes only. Whether the machine behaves as designed is what `pmsmtool prove` shows.
     """
-    from pmsmtool.cli.flash_session import checked_identity, plan_facts
+    from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.errors import VerifyMismatch
     from pmsmtool.flash.journal import read_snapshot
@@ -50,7 +50,7 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
             plan = plan_restore(node, snapshot)
     equal = len(plan.entries) - len(plan.changes)
     text = [f"{equal} of {len(plan.entries)} objects match (values only; run prove to test behaviour)"]
-    out.result("verify", {"identity": identity, "ok": not plan.changes, **plan_facts(plan)}, text)
+    out.result("verify", {"identity": identity, "ok": not plan.changes, **plan.facts()}, text)
     if plan.changes:
         chosen = "" if map_file is None else f" --map {map_file}"
         command = f"restore{' --other-drive' if other_drive else ''}" if snapshot else "flash-params"

@@ -6,7 +6,6 @@ A loop whose gains the drive has no object for is not judged: its margins would 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -38,9 +37,10 @@ from pmsmtool.design.loops.open_loops import (
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.envelope import largest_torque
-from pmsmtool.drive_maps.drive_map import Cell, DriveMap
+from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.flash.journal import read_snapshot
+from pmsmtool.flash.plan import without_assumed
 from pmsmtool.flash.restore import snapshot_set
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.catalogue import TORQUE_PER_AMPERE
@@ -84,6 +84,17 @@ def held_design(design: Design, drive_map: DriveMap) -> Design:
     ]
     asked: dict[str, Scalar] = {**design.request, "drive": drive_map.name}
     return replace(with_gains(design, gains, judged), notes=(*design.notes, *notes), request=asked)
+
+
+def refused_by_limits(
+    source: MachineFile, drive_map: DriveMap, limits: Mapping[tuple[int, int], tuple[float, float]]
+) -> dict[str, str]:
+    """Return which values of the usual design of a machine a drive with such limits refuses, and why.
+
+    Raises DesignInfeasible: the machine has no design.
+    """
+    made = held_design(tune(source, TuneRequest()), drive_map).parameter_set()
+    return drive_map.limited(limits).refused(without_assumed(drive_map, made)[0])
 
 
 _LOOPS = {CURRENT_LOOPS: "current loops", SPEED_LOOP: "speed loop"}
@@ -252,15 +263,7 @@ LEAST_DEG = 35.0
 """Least phase margin over the tolerance box with an integral time shorter than designed."""
 SLOWER = (0.85, 0.7, 0.55, 0.4)
 """Position gains, over the designed one, that are tried in turn above such a speed loop."""
-SIGNED = ("INTEGER8", "INTEGER16", "INTEGER32")
-
-
 PREDICTED = ("axis_inertia_ff_share", "axis_following_error_rad", "axis_error_rad")
-
-
-def _largest(cell: Cell) -> float:
-    """Return the largest count of an object."""
-    return math.inf if cell.wire == "REAL32" else 2.0 ** (8 * cell.size - (cell.wire in SIGNED)) - 1.0
 
 
 def _cut(drive_map: DriveMap, wanted: ParameterSet) -> dict[str, float]:
@@ -270,8 +273,8 @@ def _cut(drive_map: DriveMap, wanted: ParameterSet) -> dict[str, float]:
         if name in drive_map.cells and name in wanted.values and drive_map.writes(name, wanted.values):
             cell = drive_map.cells[name]
             counts = cell.counts(wanted.values[name], wanted.values)
-            if counts > _largest(cell):
-                found[name] = wanted.values[name] * _largest(cell) / counts
+            if counts > cell.largest:
+                found[name] = wanted.values[name] * cell.largest / counts
     return found
 
 
@@ -289,11 +292,11 @@ def _slowed(drive_map: DriveMap, group: dict[str, int], wanted: ParameterSet) ->
     for cell, power in rows:
         counts = cell.counts(wanted.values[cell.name], wanted.values)
         grows = power - group.get(cell.gain, 0)
-        share = min(share, (_largest(cell) / counts) ** (1.0 / grows) if counts and cell.form != "time" else 1.0)
+        share = min(share, (cell.largest / counts) ** (1.0 / grows) if counts and cell.form != "time" else 1.0)
     slowed = {cell.name: wanted.values[cell.name] * share**power for cell, power in rows}
     for cell, _ in rows:
         if cell.form == "time":
-            slowed[cell.name] *= max(1.0, cell.counts(slowed[cell.name], {**wanted.values, **slowed}) / _largest(cell))
+            slowed[cell.name] *= max(1.0, cell.counts(slowed[cell.name], {**wanted.values, **slowed}) / cell.largest)
     return slowed
 
 

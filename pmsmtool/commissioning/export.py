@@ -25,7 +25,7 @@ from pmsmtool.drive_maps.dcf import Entry, new_dcf, write_concise
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.drive_maps.map_tables import encode_table, look_up_words
-from pmsmtool.drive_maps.sheet_check import contradictions, family_of_sheet, types_of, unnamed_sheet
+from pmsmtool.drive_maps.sheet_check import contradictions, family_of_sheet, limits_of, types_of, unnamed_sheet
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import data_folder
 from pmsmtool.firmware.image import crc32, pack_image
@@ -260,9 +260,9 @@ def dcf_file(
     given, drive_map = drive_map is not None, drive_map or reference_map()
     if base is None:
         base = (data_folder("firmware-params") / drive_map.name / f"{drive_map.name}.eds").read_bytes()
-    encoded = drive_map.encode(checked(wanted))
-    rows = [name for name in encoded if name in drive_map.cells]
     sheet = parse_eds(base, where)
+    encoded = drive_map.limited(limits_of(sheet)).encode(checked(wanted))
+    rows = [name for name in encoded if name in drive_map.cells]
     wrong = contradictions(drive_map, types_of(sheet), rows)
     if wrong:
         more = len(wrong) - MOST_NAMED
@@ -320,10 +320,12 @@ def _take(crc: int) -> Iterator[Entry]:
 def csv_text(wanted: ParameterSet, *, drive_map: DriveMap | None = None) -> str:
     """Return a table for people and spreadsheets: one row per value, asked for and held, with its object and bytes.
 
+    A value that the drive's object does not hold has the reason in its row, and so has what acts only with it.
     A look-up table gives one row per axis or table and one per number (``lut.i_d_a[17]``, row-major).
     """
     drive_map = drive_map or reference_map()
-    encoded = drive_map.encode(checked(wanted))
+    drive_map = drive_map.without(drive_map.refused(checked(wanted)))
+    encoded = drive_map.encode(wanted)
     held = drive_map.decode(encoded)
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")

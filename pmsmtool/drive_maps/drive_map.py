@@ -24,7 +24,7 @@ from pmsmtool.drive_maps.vendor_tuning import VendorTuning
 from pmsmtool.drive_maps.wire_units import as_peak
 from pmsmtool.errors import ConfigError, next_step
 from pmsmtool.machine.torque import torque_per_ampere
-from pmsmtool.params.catalogue import CATALOGUE, INCREMENTS, OWN_SCALES, TORQUE_PER_AMPERE, layout_signature
+from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, INCREMENTS, OWN_SCALES, TORQUE_PER_AMPERE, layout_signature
 from pmsmtool.params.parameter_set import SATURATION, TABLE_NAMES, ParameterSet
 from pmsmtool.plain_text import counted
 
@@ -85,6 +85,8 @@ class Cell:
         ampere).
     source : str
         Key of ``DriveMap.sources`` that confirms the object.
+    low, high : float
+        Smallest and largest count that the drive takes, where its maker's file says so.
     """
 
     name: str
@@ -98,6 +100,8 @@ class Cell:
     unit: str = ""
     form: Form = "value"
     source: str = ""
+    low: float = -math.inf
+    high: float = math.inf
 
     def __post_init__(self) -> None:
         if self.gain and self.form == "value":
@@ -108,8 +112,16 @@ class Cell:
         """Bytes on the wire."""
         return struct.calcsize("<" + LETTERS[self.wire])
 
+    @property
+    def largest(self) -> float:
+        """Largest count that the object holds."""
+        letter = LETTERS[self.wire]
+        return self.high if letter == "f" else min(self.high, 2.0 ** (8 * self.size - letter.islower()) - 1.0)
+
     def encode(self, value: float, values: Mapping[str, float]) -> bytes:
-        """Return the bytes of an SI value. Raises ConfigError: the value does not fit the type, or the gain is missing.
+        """Return the bytes of an SI value.
+
+        Raises ConfigError: the value does not fit the type, is beyond the drive's limits, or the gain is missing.
 
         Parameters
         ----------
@@ -120,13 +132,21 @@ class Cell:
         letter = LETTERS[self.wire]
         if letter != "f":
             raw = self._rounded(raw)
+        where = f"{self.name} -> 0x{self.index:04X}:{self.sub:02X}"
         try:
-            return struct.pack("<" + letter, raw if letter == "f" else int(raw))
+            data = struct.pack("<" + letter, raw if letter == "f" else int(raw))
         except (struct.error, OverflowError, ValueError) as error:
             raise ConfigError(
-                f"{value:.9g} does not fit {self.wire} in steps of {self.factor:g}",
-                where=f"{self.name} -> 0x{self.index:04X}:{self.sub:02X}",
+                f"{value:.9g} does not fit {self.wire} in steps of {self.factor:g}", where=where
             ) from error
+        if not self.low <= raw <= self.high:
+            limit, end = (self.high, "most") if raw > self.high else (self.low, "least")
+            bound = self._meant(limit * self.factor + self.offset, values)
+            unit = BY_NAME[self.name].unit.removesuffix("1")
+            asked, taken = (f"{number:.6g} {unit}".rstrip() for number in (value, bound))
+            what = f"{asked} is {raw:.9g} in its counts, the drive takes at {end} {limit:.9g} ({taken})"
+            raise ConfigError(what, where=where)
+        return data
 
     def counts(self, value: float, values: Mapping[str, float]) -> float:
         """Return an SI value in counts of the object, not rounded yet."""
@@ -302,27 +322,45 @@ class DriveMap:
         """Whether a drive of this identity belongs to the family."""
         return vendor == self.vendor and product in (self.product, *self.more_products)
 
-    @next_step("ask for values the drive can hold (`pmsmtool tune`), or correct type and unit in its map")
+    @next_step("ask for values the drive can hold (`tune --map`, less bandwidth), or correct type and unit in its map")
     def encode(self, wanted: ParameterSet) -> dict[str, bytes]:
         """Return the bytes of every entry the drive has an object for, in the order they are written.
 
         Raises ConfigError: entries that do not fit; all of them.
         """
-        encoded: dict[str, bytes] = {}
-        wrong: list[str] = []
-        for name, value in wanted.values.items():
-            if name in self.cells and self.writes(name, wanted.values):
-                try:
-                    encoded[name] = self.cells[name].encode(value, wanted.values)
-                except ConfigError as error:
-                    wrong.append(f"{error.where}: {error.what}")
-        if wrong:
-            refused = counted(len(wrong), "value")
-            raise ConfigError(f"the drive cannot hold {refused}", where=self.name, violations=wrong)
+        encoded, refused = self._encoded(wanted)
+        if refused:
+            what = f"the drive cannot hold {counted(len(refused), 'value')}"
+            wrong = [f"{name} -> {why}" for name, why in refused.items()]
+            raise ConfigError(what, where=self.name, violations=wrong)
         for name, table in wanted.tables.items():
             if name in self.tables:
                 encoded[name] = encode_table(name, table, wanted.values)
         return encoded
+
+    def refused(self, wanted: ParameterSet) -> dict[str, str]:
+        """Return which values of a set its objects do not hold, and why: type, limits, or what it is counted by."""
+        return self._encoded(wanted)[1]
+
+    def _encoded(self, wanted: ParameterSet) -> tuple[dict[str, bytes], dict[str, str]]:
+        encoded, refused = {}, {}
+        for name, value in wanted.values.items():
+            if name in self.cells and self.writes(name, wanted.values):
+                cell = self.cells[name]
+                try:
+                    encoded[name] = cell.encode(value, wanted.values)
+                except ConfigError as error:
+                    refused[name] = f"0x{cell.index:04X}:{cell.sub:02X}: {error.what}"
+        return encoded, refused
+
+    def limited(self, limits: Mapping[tuple[int, int], tuple[float, float]]) -> DriveMap:
+        """Return the map with smallest and largest count of objects; a pair in the wrong order limits nothing."""
+        cells = {
+            name: replace(cell, low=limits[at][0], high=limits[at][1])
+            for name, cell in self.cells.items()
+            if (at := (cell.index, cell.sub)) in limits and limits[at][0] <= limits[at][1]
+        }
+        return replace(self, cells={**self.cells, **cells}, whole=self.whole or self)
 
     @next_step("compare type and size in the drive's map with its manual")
     def decode(self, found: Mapping[str, bytes], given: Mapping[str, float] | None = None) -> ParameterSet:

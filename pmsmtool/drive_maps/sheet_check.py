@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 
 from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap, SignalCell
 from pmsmtool.drive_maps.eds import Eds, parse_integer
 from pmsmtool.drive_maps.motion_objects import MotionObject
-from pmsmtool.drive_maps.shipped_maps import family_of, unnamed_drive
+from pmsmtool.drive_maps.shipped_maps import GENERIC, family_of, load_family, unnamed_drive
 from pmsmtool.errors import ConfigError
+from pmsmtool.params.catalogue import OWN_SCALES
 
 _IDENTITY = 0x1018
 _TYPE_NAMES = {row.code: row.name for row in DATA_TYPES.values()}
@@ -59,6 +61,32 @@ def _told(sheet: Eds, sub: int) -> Iterator[int]:
             continue
         if number:
             yield number
+
+
+def map_of_sheet(sheet: Eds) -> DriveMap:
+    """Return the map of a data sheet's drive: its family's (CiA 402 where none is shipped) as far as the file agrees.
+
+    Rows that the file contradicts, or lets only be read, are left out with the reason; the others have its limits.
+    """
+    drive_map, types = family_of_sheet(sheet) or load_family(GENERIC), types_of(sheet)
+    gone = {}
+    for name, cell in drive_map.cells.items():
+        entry = sheet.objects.get((cell.index, cell.sub))
+        if wrong := contradictions(drive_map, types, [name]):
+            gone[name] = wrong[0].removeprefix(f"{drive_map.name} {name} ")
+        elif entry is not None and "w" not in entry.access and name not in OWN_SCALES:
+            gone[name] = f"0x{cell.index:04X}:{cell.sub:02X}: the file lets it only be read"
+    found = drive_map.limited(limits_of(sheet))
+    return found.without(gone) if gone else found
+
+
+def limits_of(sheet: Eds) -> dict[tuple[int, int], tuple[float, float]]:
+    """Return smallest and largest number of the objects for which a sheet states one of both."""
+    return {
+        at: (-math.inf if entry.low is None else entry.low, math.inf if entry.high is None else entry.high)
+        for at, entry in sheet.objects.items()
+        if entry.low is not None or entry.high is not None
+    }
 
 
 def types_of(sheet: Eds) -> dict[tuple[int, int], str]:

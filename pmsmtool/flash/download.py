@@ -10,7 +10,7 @@ leaves an open journal: the same command, or ``restore``, finishes.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, auto
 
@@ -482,6 +482,25 @@ def stored(node: DriveNode, plan: Plan, folder: JournalFolder) -> bool | None:
         if (last := folder.last()) is not None:
             return last.shows_stored({(entry.index, entry.sub): entry.old for entry in plan.entries})
     return None
+
+
+def run_all(jobs: Iterable[Download], *, store: bool | None, to_the_end: bool) -> list[Outcome | PmsmtoolError | None]:
+    """Run downloads one after the other; None for one that was not begun after a failure.
+
+    Raises Interrupted: Ctrl-C.
+    """
+    results: list[Outcome | PmsmtoolError | None] = []
+    for job in jobs:
+        if not to_the_end and any(isinstance(result, PmsmtoolError) for result in results):
+            results.append(None)
+            continue
+        try:
+            results.append(job.run(store=store))
+        except Interrupted:
+            raise
+        except PmsmtoolError as error:
+            results.append(error)
+    return results
 
 
 @contextlib.contextmanager

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive_maps.drive_map import DriveMap, address_in
@@ -130,6 +131,19 @@ class Plan:
             return [f"the set is stored, and the drive is reset to see it: {HOMING_LOST}"]
         encoder = any(change.name.startswith("encoder.") for change in self.changes)
         return ["not stored", *([f"the encoder's parameters change: {HOMING_LOST}"] if encoder else [])]
+
+    def facts(self) -> dict[str, Any]:
+        """Return the plan for scripts."""
+        changes = [
+            {
+                "name": change.name, "object": change.where, "old": change.old_value, "wanted": change.wanted,
+                "held": change.held, "unit": change.unit, "old_bytes": change.old.hex(), "new_bytes": change.new.hex(),
+            }
+            for change in self.changes
+        ]  # fmt: skip
+        equal = len(self.entries) - len(changes)
+        said = {"missing": self.missing, "not_written": self.not_written}
+        return {"content": self.content, "changes": changes, "equal": equal, **said}
 
     def left_out(self) -> list[str]:
         """Return what of the set is not written: by name where the map states why, the rest as a number."""

@@ -11,6 +11,9 @@ from pathlib import Path
 import pytest
 
 from pmsmtool.cli.main import run
+from pmsmtool.drive_maps.drive_map_file import map_hash
+from pmsmtool.drive_maps.eds import parse_eds
+from pmsmtool.drive_maps.sheet_check import map_of_sheet
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.params.catalogue import BY_NAME, OWN_SCALES
 from pmsmtool.params.parameter_set import ParameterSet
@@ -143,6 +146,59 @@ def test_caps_says_which_rows_the_drive_contradicts(home: Path, capsys: pytest.C
     assert any("torque_slope" in line and "the drive has no object" in line for line in said)
     assert any(line.split()[:3] == ["written:", "motor.L_q_h", "0x6410:08"] for line in out.splitlines())
     assert "serial" not in out.splitlines()[0], "no drive was asked"
+
+
+LIMITS = {(0x30A0, 1): (0, 2_000_000), (0x30A0, 2): (0, 2_000_000), (0x6081, 0): (5, 1)}
+TOO_MUCH = "current.K_p_q_v_per_a: 0x30A0:01: 3 V/A is 3000000 in its counts, the drive takes at most 2000000 (2 V/A)"
+
+
+def test_a_makers_file_is_a_map_with_its_limits(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What a drive refuses was noticed when it was flashed, as an abort code."""
+    more: tuple[Row, ...] = (
+        (0x30A1, 1, "U16", "rw", "1"), (0x6081, 0, "U32", "rw", "1"), (0x6083, 0, "U32", "ro", "1")
+    )  # fmt: skip
+    rows = (*(row for row in epos4() if row[:2] not in {one[:2] for one in more} | {(0x30A2, 2)}), *more)
+    path = write_eds(home / "theirs.eds", rows, LIMITS)
+    narrow, family = map_of_sheet(parse_eds(path.read_bytes())), load_family("epos4")
+    assert map_hash(narrow) == map_hash(family) and narrow.whole == family, "flashed through either, it is the same map"
+    name = "reference.profile_speed_rpm"
+    assert narrow.cells[name] == family.cells[name], "limits in the wrong order limit nothing"
+    assert "the file has no such object" in narrow.left_out["speed.K_i_nm_per_rad"]
+    assert "the file has UNSIGNED16" in narrow.left_out["position.pid_p_nm_per_rad"]
+    assert narrow.left_out["reference.profile_acceleration_rpm_per_s"] == "0x6083:00: the file lets it only be read"
+    assert narrow.cells["current.K_p_q_v_per_a"].largest == 2_000_000
+
+    assert run(["export", "csv", str(home / "params.toml"), "--map", str(path)]) == 0
+    told = capsys.readouterr()
+    held = {row["name"]: row for row in csv.DictReader(io.StringIO(told.out))}
+    assert f"not written: {TOO_MUCH}" in told.err
+    assert held["current.K_p_q_v_per_a"]["not written because"] == TOO_MUCH.split(": ", 1)[1]
+    assert "not without current.K_p_q" in held["current.K_i_q_v_per_as"]["not written because"], "it fits, alone"
+    assert run(["param", "diff", str(home / "params.toml"), str(home / "params.toml"), "--map", str(path)]) == 0
+    assert f"not compared, not written: {TOO_MUCH}" in capsys.readouterr().err
+    assert exported(home, path) == 2
+    assert TOO_MUCH.replace(": ", " -> ", 1) in capsys.readouterr().err and not (home / "out.dcf").exists()
+
+
+def test_caps_names_what_of_a_design_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Before a bus is opened."""
+    for limits, refused in (({}, set()), (LIMITS, {"current.K_p_q_v_per_a", "current.K_i_q_v_per_as"})):
+        path = write_eds(home / "theirs.eds", epos4(), limits)
+        assert run(["caps", "interior-2k2", "--eds", str(path), "--json"]) == 0
+        told = capsys.readouterr()
+        assert set(json.loads(told.out)["refused"]) == refused
+        assert told.err.count("of the design of interior-2k2 this drive refuses") == len(refused)
+
+
+def test_a_value_counted_by_another_has_its_reason_in_the_table(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The table of a whole design for a drive by CiA 402 ended with exit code 2."""
+    (home / "whole.toml").write_text(ParameterSet({**GAINS, "speed.tau_max_nm": 3.0, "motor.n_max_rpm": 9.0}).to_toml())
+    assert run(["export", "csv", str(home / "whole.toml"), "--map", "cia402"]) == 0
+    told = capsys.readouterr()
+    rows = {row["name"]: row for row in csv.DictReader(io.StringIO(told.out))}
+    assert rows["motor.n_max_rpm"]["object"] == "0x6080:00"
+    assert "needs reference.tau_rated_nm in the same set" in rows["speed.tau_max_nm"]["not written because"]
+    assert "not written: speed.tau_max_nm: 0x6072:00: needs" in told.err
 
 
 def test_diff_says_what_is_equal_and_what_is_not_compared(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
