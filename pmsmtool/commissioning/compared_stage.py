@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
+from typing import Any
 
 from pmsmtool.commissioning.contradiction import ACCEPTABLE, DATA_SHEET, EXACT, HELD, ORDER, RATIO, compare
 from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -18,6 +19,7 @@ from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement.capabilities import Capabilities
 from pmsmtool.params.parameter_set import default_set
+from pmsmtool.plain_text import by_reason
 from pmsmtool.report.comparison import contradictions
 from pmsmtool.run_directory import RunDirectory, Stage
 
@@ -160,8 +162,18 @@ def refusal(stage: Stage, run: RunDirectory) -> Contradiction | None:
     elif all(name in ACCEPTABLE for name in names):
         hint += f"; or, knowing why, add {' '.join(f'--accept-contradiction {name}' for name in names)}"
     return Contradiction(
-        "\n  - ".join([CONTRADICTS if stage.values else UNMOVED, *(str(row["text"]) for row in wrong)]),
+        "\n  - ".join([CONTRADICTS if stage.values else UNMOVED, *map(_without_cause, wrong)]),
         where=str(run.path),
-        likely="; ".join(dict.fromkeys(str(row["cause"]) for row in wrong if row["cause"])),
+        likely="; ".join(by_reason(map(_with_ratio, (row for row in wrong if row["cause"])))),
         hint=hint,
     )
+
+
+def _without_cause(row: Mapping[str, Any]) -> str:
+    return str(row["text"]).removesuffix(f"; likely {row['cause']}")
+
+
+def _with_ratio(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Return a value with the ratio by which it is wrong, and the cause alone: several values may share one."""
+    cause, _, ratio = str(row["cause"]).partition(" (x")
+    return f"{row['name']}{f' x{ratio[:-1]}' if ratio else ''}", cause

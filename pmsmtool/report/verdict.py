@@ -132,13 +132,14 @@ def verdict_of(record: Mapping[str, Any], complete: Sequence[str] = COMPLETE) ->
     ran = [stage for stage in latest if stage["status"] in RAN]
     left = [*unmeasured, *_unchecked(latest, complete)]
     missing = [*_missing(latest, complete), *_unfinished(account, latest)]
-    head = _counted(ran, latest, complete)
-    partial = bool(missing or left or not ran) or any(stage["status"] == "partial" for stage in latest)
+    head = "; ".join((*_interrupted(latest, complete), _counted(ran, latest, complete)))
+    partial = bool(missing or left or not ran) or any(stage["status"] in _PARTLY for stage in latest)
     if not partial:
         return Verdict("pass", "PASS", (head, *_shown(latest, complete), *accepted), simulated)
     return Verdict("partial", "PARTIAL", ("; ".join((*_wrong(latest), head, *left)), *accepted, *missing), simulated)
 
 
+_PARTLY = ("partial", "interrupted")
 _NOT_JUDGED = (ExitCode.DECLINED, ExitCode.INTERRUPTED)
 """Exit codes of a run that a person ended: no criterion was broken."""
 
@@ -148,6 +149,16 @@ def _failures(latest: Sequence[Mapping[str, Any]], *, stopped: bool) -> list[str
     ended = ("refused", "interrupted") if stopped else ()
     failed = [stage for stage in latest if stage["status"] not in (*RAN, UNAVAILABLE, *ended)]
     return [f"{_with_status(stage)}: {_failure(stage)}" for stage in failed]
+
+
+def _interrupted(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> list[str]:
+    """Return where a person ended the run, and how the drive was left: what he wants to know first."""
+    again = "; resumed, it begins with that stage again" if len(complete) > 1 else ""
+    return [
+        f"interrupted during {stage['name']}: {stage['note']}{again}"
+        for stage in latest
+        if stage["status"] == "interrupted"
+    ]
 
 
 def _wrong(latest: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -196,7 +207,7 @@ def _missing(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> li
     lines = [
         f"{_with_status(stage)}: {str(stage['note']) or _failure(stage)}"
         for stage in latest
-        if stage["status"] != "pass" and not stage.get("refused")
+        if stage["status"] not in ("pass", "interrupted") and not stage.get("refused")
     ]
     lines += _refused(latest)
     never = [name for name in complete if name not in found and len(complete) > 1]
@@ -233,6 +244,8 @@ def _counted(ran: Sequence[Mapping[str, Any]], latest: Sequence[Mapping[str, Any
         names = " and ".join(str(stage["name"]) for stage in latest)
         return f"{names}{' alone' if len(latest) == 1 else ''}, {met}" if names else f"{complete[0]} did not run"
     count = sum(stage["name"] in complete for stage in ran)
+    if not count:
+        return "no stage came to its end"
     proven = "" if any(stage["name"] == "prove" for stage in ran) else ", behaviour not proven"
     return f"{count} of {len(complete)} stages ran, {met}{proven}"
 

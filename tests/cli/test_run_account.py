@@ -78,7 +78,7 @@ def test_an_interrupted_identification_says_what_happened_and_what_is_complete(
     assert [(stage.name, stage.status) for stage in record.stages] == [("identify", "interrupted")]
     data, page = reported(tool, run)
     assert data["verdict"] == "PARTIAL"
-    assert any("identify: interrupted" in line for line in data["reasons"]), data["reasons"]
+    assert data["reasons"][0].startswith("interrupted during identify: the machine is stopped, voltage off, and the")
     assert data["ended"] == account_lines(account)
     assert "How the run ended" in page and "exit code 130" in page and "zero_current" in page and restored in page
 

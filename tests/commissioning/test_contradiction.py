@@ -6,13 +6,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
 from pmsmtool.commissioning import compared_stage
-from pmsmtool.commissioning.compared_stage import check_accepted, contradicted_unmoved
+from pmsmtool.commissioning.compared_stage import check_accepted, contradicted_unmoved, refusal
 from pmsmtool.commissioning.contradiction import ACCEPTABLE, HELD, OTHER_MOTOR, Row, compare
 from pmsmtool.errors import ConfigError, SafetyRefusal
 from pmsmtool.files import data_folder
@@ -21,6 +22,7 @@ from pmsmtool.measurement.capabilities import reference_capabilities
 from pmsmtool.params.parameter_set import default_set
 from pmsmtool.report.comparison import headline, marks, table_cells, unchecked
 from pmsmtool.report.report import verdict_of
+from pmsmtool.run_directory import RunDirectory, Stage
 
 TRUTH = replace(load_machine_file(data_folder("profiles") / "interior-2k2.toml"), std={})
 """No standard deviations: the tolerances of a catalogue hold."""
@@ -332,3 +334,13 @@ def test_the_table_shows_all_three() -> None:
     cells = {cell[0]: cell for cell in table_cells(rows)}
     assert cells["pole_pairs"][1:] == ("3", "exact", "3", "3", "agrees")
     assert cells["psi_f_wb"][1] == "0.545 Wb" and "data sheet 10 %" in cells["psi_f_wb"][2]
+
+
+def test_values_with_one_cause_name_it_once(tmp_path: Path) -> None:
+    """Three values read line to line named it three times each."""
+    rows = compare(stated(R_s_ohm=0.5, L_d_h=0.5, L_q_h=0.5, psi_f_wb=0.7), {}, measured())
+    stage = Stage("identify", "fail", 1.0, values=[{"name": "R_s_ohm"}], comparison=[row.facts() for row in rows])
+    error = refusal(stage, RunDirectory(tmp_path))
+    assert error is not None and "likely" not in error.what and error.what.count("the data sheet states") == 4
+    assert error.likely.startswith("R_s_ohm x2 is near 2, L_d_h x2 is near 2, L_q_h x2 is near 2: line to line instead")
+    assert error.likely.endswith("; psi_f_wb x1.43 is near 1.414: rms instead of peak")

@@ -53,7 +53,11 @@ def test_a_stage_that_did_not_hold_fails(status: str) -> None:
 def test_a_run_that_a_person_ended_broke_no_criterion(status: str, code: int) -> None:
     ended = {"state": status, "stage": "flash", "exit_code": code, "what": "no"}
     found = verdict_of(record(stage("flash", status), account=ended))
-    assert found.kind == "partial" and f"flash: {status}: flash says why" in found.details
+    said = "interrupted during flash: flash says why; resumed, it begins with that stage again; 6 of 7 stages ran"
+    assert found.kind == "partial" and found.headline.startswith(f"PARTIAL: {said}") is (status == "interrupted")
+    assert (f"flash: {status}: flash says why" in found.details) is (status == "refused")
+    nothing = verdict_of({"stages": [stage("identify", status)], "account": ended}).headline
+    assert nothing.endswith("no stage came to its end")
 
 
 def test_wrong_wiring_comes_before_what_ran() -> None:
