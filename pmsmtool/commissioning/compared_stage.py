@@ -10,7 +10,7 @@ from typing import Any
 
 from pmsmtool.commissioning.contradiction import ACCEPTABLE, DATA_SHEET, EXACT, HELD, ORDER, RATIO, compare
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.motion_objects import ENCODER_COUNTS, MOTOR_TURNS
+from pmsmtool.drive.motion_objects import encoder_counts
 from pmsmtool.drive.standard_drive import RecorderDrive
 from pmsmtool.errors import ConfigError, Contradiction, SafetyRefusal, SdoAbort
 from pmsmtool.estimators.estimate import total_half_width
@@ -66,10 +66,9 @@ def held_values(drive: CanopenDrive) -> dict[str, float]:
         value = drive.parameters.held_value(f"motor.{key}")
         held |= {} if value is None else {key: value}
     with contextlib.suppress(SdoAbort):
-        if drive.node.has(ENCODER_COUNTS.index, ENCODER_COUNTS.sub):
-            counts = drive.node.get(ENCODER_COUNTS) / max(1.0, drive.node.get(MOTOR_TURNS))
-            if counts >= LEAST_COUNTS:
-                held["encoder_counts"] = counts
+        counts = encoder_counts(drive.node)
+        if counts is not None and counts >= LEAST_COUNTS:
+            held["encoder_counts"] = counts
     return held
 
 

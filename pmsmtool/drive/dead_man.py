@@ -21,6 +21,7 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe, state_text
 from pmsmtool.drive.heartbeat import PERIOD_S, Heartbeat, expect_pdo
+from pmsmtool.drive.objects import DriveObject
 from pmsmtool.errors import BusError, SafetyRefusal, SdoAbort
 
 CONSUMER_MS = 250
@@ -225,10 +226,10 @@ def _set_consumer(drive: CanopenDrive) -> str:
     word = (TOOL_NODE << 16 | CONSUMER_MS).to_bytes(4, "little")
     try:
         count = node.sdo.read(objects.CONSUMER_HEARTBEAT, 0, size=1)[0]
-        entries = {
-            sub: int.from_bytes(node.sdo.read(objects.CONSUMER_HEARTBEAT, sub, size=4), "little")
-            for sub in range(1, count + 1)
-        }
+        held = {sub: node.held(DriveObject(objects.CONSUMER_HEARTBEAT, sub, "I")) for sub in range(1, count + 1)}
+        entries = {sub: int(word) for sub, word in held.items() if word is not None}  # some count more than they have
+        if not entries:
+            return NO_CONSUMER
         free = [sub for sub, word in entries.items() if word >> 16 & 0xFF in (TOOL_NODE, 0)]
         if not free:
             return "all entries of the consumer heartbeat time (0x1016) are taken"

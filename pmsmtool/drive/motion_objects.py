@@ -50,6 +50,8 @@ INCREMENTS = (0x00, 0xB5)
 """Numerators of units of the encoder; others, as metres, say nothing of a turn without the feed (0x6092)."""
 RATED_RMS = 1e-3 * math.sqrt(2.0)
 """A peak per count of 0x6075, taken as mA rms: the larger of the two readings."""
+SAME_RATED = 0.01
+"""Two statements of one rated current differ by less: the step of a maker's own is 10 mA; peak and rms are 1.41."""
 MOST_RATED_MA = 1e7
 """Largest rated current of a motor (mA). 0 and 0xFFFFFFFF are drives without a motor's data; a REAL32 reads as 1e9."""
 SAME_UNITS = 1e-6
@@ -140,8 +142,16 @@ def rated_ma(node: DriveNode) -> float | None:
 
 
 def rated_current(node: DriveNode) -> Quantity | None:
-    """Return where the rated current stands; None where nobody knows."""
-    return _stated_rated(node) if rated_ma(node) is not None else _own(node, "rated_current")
+    """Return where the rated current stands; None where nobody knows.
+
+    A maker's own object of the same current, whose kind of ampere is known, tells that of 0x6075.
+    """
+    own, stated = _own(node, "rated_current"), rated_ma(node)
+    if own is None or stated is None:
+        return own if stated is None else _stated_rated(node)
+    apk = 0.0 if own.undecided else own.per_count * (node.held(own.item) or 0.0)
+    same = any(math.isclose(apk, per_count * stated, rel_tol=SAME_RATED) for per_count in (1e-3, RATED_RMS))
+    return own if same else _stated_rated(node)
 
 
 def _stated_rated(node: DriveNode) -> Quantity:
@@ -158,20 +168,17 @@ def rated_apk(node: DriveNode) -> float:
 
     Raises NotAvailable: the drive does not say.
     """
-    found = rated_ma(node)
-    if found is not None:
-        return _stated_rated(node).per_count * found
+    stands = rated_current(node)
     row = node.map.motion.get("rated_current")
-    if row is not None and row.number:  # no object holds it: its owner wrote it into the map
+    if stands is None and row is not None and row.number:  # no object holds it: its owner wrote it into the map
         return row.per_count * row.number
-    own = _own(node, "rated_current")
-    found = None if own is None else node.held(own.item)
-    if own is None or found is None:
+    found = None if stands is None else node.held(stands.item)
+    if stands is None or found is None:
         raise NotAvailable(
             f"the drive does not report {NO_RATED}", where=f"node {node.node}",
             hint="`pmsmtool caps` lists what this drive can measure",
         )  # fmt: skip
-    return own.per_count * found
+    return stands.per_count * found
 
 
 def shown_current(node: DriveNode, rated: float) -> Quantity:
@@ -422,13 +429,20 @@ def _shown_units(node: DriveNode) -> float:
             where=f"node {node.node}, 0x6091",
             hint=f"set it to 1:1, or the feed (0x6092), with the maker's software, {STATE_UNITS}",
         )  # fmt: skip
+    counts = encoder_counts(node)
+    if counts is None:
+        raise NotAvailable(f"the drive does not report {NO_COUNTS}", where=f"node {node.node}")
+    return counts
+
+
+def encoder_counts(node: DriveNode) -> float | None:
+    """Return the increments of a turn: 0x608F, else the maker's own object; None where the drive has neither."""
     counts = node.held(ENCODER_COUNTS)
     if counts is not None:
         return counts / max(1.0, node.held(MOTOR_TURNS) or 1.0)
     own = _own(node, "counts_per_turn")
-    if own is None:
-        raise NotAvailable(f"the drive does not report {NO_COUNTS}", where=f"node {node.node}")
-    return own.per_count * node.get(own.item)
+    held = None if own is None else node.held(own.item)
+    return None if own is None or held is None else own.per_count * held
 
 
 def current_limits(node: DriveNode, rated: float) -> Iterator[Quantity]:

@@ -354,11 +354,11 @@ class DriveMap:
         return encoded, refused
 
     def limited(self, limits: Mapping[tuple[int, int], tuple[float, float]]) -> DriveMap:
-        """Return the map with smallest and largest count of objects; a pair in the wrong order limits nothing."""
+        """Return the map with smallest and largest count of objects."""
         cells = {
             name: replace(cell, low=limits[at][0], high=limits[at][1])
             for name, cell in self.cells.items()
-            if (at := (cell.index, cell.sub)) in limits and limits[at][0] <= limits[at][1]
+            if (at := (cell.index, cell.sub)) in limits
         }
         return replace(self, cells={**self.cells, **cells}, whole=self.whole or self)
 

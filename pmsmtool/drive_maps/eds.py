@@ -344,10 +344,13 @@ def _entry(
     if access not in _ACCESS:
         warnings.append(f"{place}sub{sub:X}: AccessType {access or 'missing'}, taken as ro")
         access = "ro"
-    limits = []
-    for key in ("lowlimit", "highlimit"):
-        limit = _number(section.get(key), data_type, f"{place}sub{sub:X} {key}", warnings, node)
-        limits.append(limit)
+    low, high = (
+        _number(section.get(key), data_type, f"{place}sub{sub:X} {key}", warnings, node)
+        for key in ("lowlimit", "highlimit")
+    )
+    if low is not None and high is not None and low > high:
+        warnings.append(f"{place}sub{sub:X}: LowLimit {low} is above HighLimit {high}, both left out")
+        low = high = None
     for key in ("lowlimit", "highlimit", "defaultvalue", "parametervalue"):
         text = section.get(key)
         if data_type in INTEGER_BITS and OCTAL.fullmatch(text) and int(text) != int(text, 8):
@@ -361,8 +364,8 @@ def _entry(
         name,
         data_type,
         access,
-        limits[0],
-        limits[1],
+        low,
+        high,
         section.get("defaultvalue"),
         section.get("parametervalue"),
         section.line,

@@ -12,7 +12,7 @@ from typing import Any, Literal
 from xml.etree import ElementTree
 
 from pmsmtool.errors import ExitCode
-from pmsmtool.plain_text import plain
+from pmsmtool.plain_text import by_reason, plain
 from pmsmtool.report.comparison import headline, not_checked, unchecked
 
 COMPLETE = ("identify", "tune", "margins", "lut", "flash", "verify", "prove")
@@ -204,11 +204,10 @@ def _unchecked(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> 
 def _missing(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> list[str]:
     """Return which stages did not run, or not wholly, each with its reason."""
     found = {stage["name"] for stage in latest}
-    lines = [
-        f"{_with_status(stage)}: {str(stage['note']) or _failure(stage)}"
-        for stage in latest
-        if stage["status"] not in ("pass", "interrupted") and not stage.get("refused")
-    ]
+    odd = [stage for stage in latest if stage["status"] not in ("pass", "interrupted") and not stage.get("refused")]
+    how = ("" if stage["status"] == "fail" else f": {stage['status']}" for stage in odd)
+    ended = [f"{end}: {str(stage['note']) or _failure(stage)}" for stage, end in zip(odd, how, strict=True)]
+    lines = by_reason(((str(stage["name"]), why) for stage, why in zip(odd, ended, strict=True)), "")
     lines += _refused(latest)
     never = [name for name in complete if name not in found and len(complete) > 1]
     return [*lines, *([f"not run: {', '.join(never)}"] if never else [])]
@@ -216,7 +215,7 @@ def _missing(latest: Sequence[Mapping[str, Any]], complete: Sequence[str]) -> li
 
 def _refused(stages: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return what was asked for and refused, each with its reason."""
-    return [f"{name}: refused: {why}" for stage in stages for name, why in (stage.get("refused") or {}).items()]
+    return by_reason((reason for stage in stages for reason in (stage.get("refused") or {}).items()), ": refused: ")
 
 
 def _unfinished(account: Mapping[str, Any], latest: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -50,6 +50,7 @@ from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.simulated_machine import with_simulation
 from tests.commissioning.audience import Quiet, Told
+from tests.foreign.data_sheets import nothing_for_motion
 
 pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
 
@@ -97,7 +98,7 @@ def chain(
 @pytest.fixture(scope="module")
 def designed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run of a drive that takes a rated current alone: its machine file is what was given."""
-    with opened("&drive=faulhaber") as (drive, found):
+    with opened(f"&drive={nothing_for_motion(tmp_path_factory.mktemp('map'))}") as (drive, found):
         run = begin_run(drive, tmp_path_factory.mktemp("designed"), level=found.level)
         progress, _ = chain(run, drive, found)
     assert progress.ended == {
@@ -367,7 +368,7 @@ def test_the_plan_of_a_drive_that_takes_nothing_promises_no_loop(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    bus = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=faulhaber"]
+    bus = ["-i", "pmsmsim", "-c", f"interior-2k2?nv=:memory:&drive={nothing_for_motion(tmp_path)}"]
     outcome = CliRunner().invoke(cli, [*bus, "commission", str(PROFILE), "--yes"])
     assert outcome.exit_code == ExitCode.PARTIAL, "what it can give: a table for reading"
     plan = outcome.stderr.splitlines()

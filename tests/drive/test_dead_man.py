@@ -203,6 +203,14 @@ def test_all_entries_taken_is_refused(bench: SimBench) -> None:
         pass
 
 
+def test_a_drive_that_counts_more_entries_than_it_has_is_supervised(bench: SimBench) -> None:
+    """It was refused as one without a consumer heartbeat."""
+    for sub in (2, 3, 4):
+        bench.session.dictionary.hide(0x1016, sub)
+    with guarded(bench.drive, ENVELOPE) as guard:
+        assert guard.proof is not None
+
+
 @pytest.mark.parametrize(("held", "after"), [(CONSUMER_MS, 0), (CONSUMER_MS + 1, TOOL_NODE << 16 | CONSUMER_MS + 1)])
 def test_the_entry_a_killed_run_left_is_freed_and_an_owners_is_kept(bench: SimBench, held: int, after: int) -> None:
     bench.drive.node.sdo.download(0x1016, 1, (TOOL_NODE << 16 | held).to_bytes(4, "little"))

@@ -175,6 +175,8 @@ class Rig:
         if self.kind.standard:
             share = 1.0 / self.rated_apk if self.kind.rated == (0x6075, 0) else math.sqrt(0.5)  # per mille, or mA
             self._show(0x6078, 0, lambda: round(-1000.0 * ampere * share))
+            if (own := self.drive.node.map.motion.get("current")) is not None and own.index != 0x6078:
+                self._show(own.index, own.sub, lambda: round(-ampere / own.per_count))
             return
         self._show(0x2070, 1, lambda: -0.6 * ampere)
         self._show(0x2070, 2, lambda: 0.8 * ampere)

@@ -45,6 +45,9 @@ def drive(held: Held, signals: dict[str, SignalCell] | None = None, /, **rows: M
     [
         (RATED, {}, RATED_APK, "0x6075"),
         ({**RATED, OWN: 700}, {"rated_current": own(PEAK)}, RATED_APK, "0x6075"),  # the standard's first
+        ({**RATED, OWN: 566}, {"rated_current": own(PEAK)}, 5.66, "0x3001:01"),  # 0x6075 is rms, by the maker's own
+        ({**RATED, OWN: 400}, {"rated_current": own(PEAK)}, 4.0, "0x3001:01"),  # or peak
+        ({**RATED, OWN: 566}, {"rated_current": own(OPEN)}, RATED_APK, "0x6075"),
         (RATED, {"rated_current": STATED}, RATED_APK / math.sqrt(2.0), "0x6075"),  # which a map says is peak
         ({OWN: 700}, {"rated_current": own(PEAK)}, 7.0, "0x3001:01"),
         ({OWN: 700}, {"rated_current": own(RMS)}, 7.0 * math.sqrt(2.0), "0x3001:01"),

@@ -41,6 +41,7 @@ from pmsmtool.measurement.capabilities import (
     reference_capabilities,
 )
 from pmsmtool.trace import Trace
+from tests.foreign.data_sheets import nothing_for_motion
 
 COMMANDS = (0x604000, 0x206007)
 """Controlword and the recorder's command: nothing a restore would bring back."""
@@ -65,13 +66,17 @@ def examined(options: str) -> Capabilities:
         ("&level=recorder", CapabilityLevel.RECORDER, "pmsmsim"),
         ("&drive=cia402", CapabilityLevel.STANDARD, "cia402"),
         ("&drive=epos4", CapabilityLevel.STANDARD, "epos4"),
-        ("&drive=epos2", CapabilityLevel.MANUAL, "epos2"),
-        ("&drive=faulhaber", CapabilityLevel.MANUAL, "faulhaber"),
+        ("&drive=epos2", CapabilityLevel.STANDARD, "epos2"),
+        ("&drive=faulhaber", CapabilityLevel.STANDARD, "faulhaber"),
+        ("&drive=bare.toml", CapabilityLevel.MANUAL, "faulhaber"),
         ("&drive=copley", CapabilityLevel.STANDARD, "copley"),
         ("&drive=zeroerr", CapabilityLevel.STANDARD, "zeroerr"),
     ],
 )
-def test_level_from_map_and_drive(options: str, level: CapabilityLevel, map_name: str) -> None:
+def test_level_from_map_and_drive(
+    options: str, level: CapabilityLevel, map_name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(nothing_for_motion(tmp_path).parent)
     found = examined(options)
     assert (found.level, found.drive_map.name) == (level, map_name)
 
@@ -185,9 +190,9 @@ def test_caps_of_an_unknown_drive_says_so() -> None:
     ("options", "arguments", "said"),
     [
         ("&drive=epos4", ("R",), "R by inject: not available: needs current set-points for d and q"),
-        ("&drive=epos2", (), "encoder, poles by standard: not available: needs"),
+        ("&drive=bare.toml", (), "encoder, poles by standard: not available: needs"),
         ("&drive=cia402", ("L",), "L by recorder: not available: needs a recorder of currents and voltages"),
-        ("&drive=epos2", ("mechanics",), "mechanics by standard: not available: needs torque mode"),
+        ("&drive=bare.toml", ("mechanics",), "mechanics by standard: not available: needs torque mode"),
         ("&level=recorder", ("encoder",), "encoder by inject: not available: needs"),
         ("", ("R", "--method", "vendor"), "R by vendor: not available: needs the maker's identification"),
         ("", ("R", "--method", "manual"), "R by manual: a number you bring"),
@@ -197,7 +202,7 @@ def test_caps_of_an_unknown_drive_says_so() -> None:
 def test_identify_ends_in_exit_9_and_names_what_is_missing(
     options: str, arguments: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(nothing_for_motion(tmp_path).parent)
     outcome = run("--sim", CHANNEL + options, "--yes", "identify", *arguments)
     error = outcome.exception
     assert isinstance(error, NotAvailable) and error.exit_code == 9
@@ -230,7 +235,8 @@ def test_a_locked_shaft_gives_nothing_without_injection(monkeypatch: pytest.Monk
 
 def test_commission_of_a_drive_that_gives_nothing_is_exit_9(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    outcome = run("--sim", CHANNEL + "&drive=faulhaber", "--yes", "commission")
+    nothing_for_motion(tmp_path)
+    outcome = run("--sim", CHANNEL + "&drive=bare.toml", "--yes", "commission")
     assert isinstance(outcome.exception, NotAvailable) and outcome.exception.exit_code == 9
     text = str(outcome.exception)
     assert "identify: needs torque mode" in text and "tune: needs pole_pairs, R_s_ohm" in text

@@ -4,9 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 from pmsmtool.data_types import BY_SHORT
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map
+from pmsmtool.drive_maps.shipped_maps import load_family
 
 TYPES = {short: row.code for short, row in BY_SHORT.items()}
 Row = tuple[int, int, str, str, str]
@@ -107,4 +110,11 @@ def write_eds(
             low, high = limits[index, sub]
             lines += [f"LowLimit={low}", f"HighLimit={high}"]
     path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    return path
+
+
+def nothing_for_motion(folder: Path) -> Path:
+    """Write the map of a drive without the maker's own objects for currents: nothing limits one."""
+    path = folder / "bare.toml"
+    path.write_text(dump_drive_map(replace(load_family("faulhaber"), motion={})), encoding="utf-8")
     return path

@@ -10,14 +10,17 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from pmsmtool.bus.connect import connect
+from pmsmtool.bus.connect import Connection, connect
 from pmsmtool.cli.drive_access import rehearsal_bus
 from pmsmtool.cli.main import cli
 from pmsmtool.cli.options import BusOptions
 from pmsmtool.commissioning import level_stages
 from pmsmtool.commissioning.commission import begin_run
 from pmsmtool.drive.drive_node import DriveNode
+from pmsmtool.drive.motion_objects import encoder_counts, held_current_limits, rated_apk
+from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive_maps.drive_map import LETTERS
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.files import data_folder
@@ -33,6 +36,7 @@ from pmsmtool.measurement.capabilities import examine
 from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.run_directory import Stage
+from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.channel import parse_channel
 from tests.foreign.data_sheets import GUARDING, Row, copley, epos4, unknown, write_eds
 
@@ -105,11 +109,29 @@ def test_a_rehearsal_is_a_channel_of_the_simulated_bus(tmp_path: Path) -> None:
         rehearsal_bus(BusOptions("socketcan", "can0"), eds="x.eds")
 
 
+@pytest.mark.parametrize("family", ["copley", "epos2", "epos4", "faulhaber", "nanotec"])
+def test_a_family_shows_the_makers_own_objects_for_the_standards(family: str) -> None:
+    """By its map alone a Copley was known by 0x6075, whose amperes nobody states, and a Faulhaber gave nothing."""
+    own = load_family(family).motion
+    with Connection(PmsmSimBus(f"interior-2k2?nv=:memory:&drive={family}")) as connection:
+        node = DriveNode(connection, 1)
+        assert ("mechanics", "standard", True) in [(r.quantity, r.method, r.available) for r in examine(node).rows()]
+        assert abs(rated_apk(node) / 6.08 - 1.0) < 1e-3, "as rms where the map leaves it open"
+        assert encoder_counts(node) == 131072
+        row = own["current_limit"]
+        limits = {q.item.index: apk for q, apk in held_current_limits(node, rated_apk(node))}
+        assert abs(limits[row.index] / 12.0 - 1.0) < 1e-3, "that of the motor"
+        node.put(DriveObject(row.index, row.sub, LETTERS[row.wire]), 1000)
+        limits = {q.item.index: apk for q, apk in held_current_limits(node, rated_apk(node))}
+        assert abs(limits[row.index] / (1000 * row.per_count) - 1.0) < 1e-9
+        node.close()
+
+
 def test_commission_rehearses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A drive that gives nothing: the chain says so before anything moves, as on a real one."""
     monkeypatch.chdir(tmp_path)
     eds = ["--eds", str(write_eds(tmp_path / "x.eds", epos4(0x25)))]
-    for option in (["--rehearse", "faulhaber"], eds, ["--rehearse", *eds]):
+    for option in (eds, ["--rehearse", *eds]):
         error = run("commission", *option, "--yes").exception
         assert isinstance(error, NotAvailable) and "identify: needs" in str(error) and "torque mode" in str(error)
     assert run("commission", "--eds", "x.eds", "--resume", "runs/1").exit_code == 2

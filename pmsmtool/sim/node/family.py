@@ -11,13 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import Schedule
 from pmsmtool.cia402 import Mode
 from pmsmtool.data_types import SHORT
 from pmsmtool.drive_maps.drive_map import REFERENCE_PRODUCT, REFERENCE_VENDOR, Cell, DriveMap, SignalCell
-from pmsmtool.drive_maps.motion_objects import UNDECIDED
+from pmsmtool.drive_maps.motion_objects import MotionObject
 from pmsmtool.drive_maps.wire_units import WireUnit, wire_unit
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, TORQUE_PER_AMPERE
@@ -60,6 +61,15 @@ RECORDERS: Mapping[str, Callable[[DriveMap, Dictionary, Plant], object]] = {
     "rings": Rings,
 }
 """Makers' recorders by the kind a map says."""
+BEHIND = {
+    "rated_current": "cia402.rated_current",
+    "current_limit": "cia402.max_current",
+    "target_current": "cia402.target_torque",
+    "asked_current": "cia402.torque_demand",
+    "current": "live.i_q_a",
+    "counts_per_turn": "cia402.encoder_counts",
+}
+"""What acts behind a maker's own object, by row of [motion]."""
 _LIVE = {
     "position_rad": "live.theta_m_rad",
     "i_q_a": "live.i_q_a",
@@ -112,23 +122,21 @@ class Face:
             hidden |= {0x6071, 0x6074, 0x6087, 0x60B2}
         if not self.drive_map.capabilities.velocity_mode:
             hidden |= {0x60FF}
+        own = {name: row for name, row in self.drive_map.motion.items() if name in BEHIND and row.index}
         for index in hidden:
             dictionary.hide(index)
         for name, signal in self.drive_map.signals.items():
             dictionary.show(_signal_entry(name, signal, dictionary))
-        current = self.drive_map.motion.get("current")
-        if current is not None and current.index in STANDARD:
-            # a standard object that counts otherwise; amperes are rms, as those of the rated current (0x6075) and limit
-            unit = current.unit.replace(UNDECIDED, " rms")
-            signal = SignalCell(current.index, current.sub, current.wire, unit, current.source)
-            dictionary.show(_signal_entry("i_q_a", signal, dictionary))
+        for name, row in own.items():
+            dictionary.show(_motion_entry(name, row, dictionary))
         revisions = self.drive_map.identity.revisions
         if revisions:
             dictionary["identity.revision"].put(revisions[-1] << 16)
         tuning = self.drive_map.vendor_tuning
-        own = () if tuning is None else (tuning.mode,)
+        modes = {} if tuning is None else {tuning.mode: Mode.IDENTIFICATION}
+        modes |= {row.mode: Mode.CYCLIC_TORQUE for name, row in own.items() if name == "target_current"}
         parameters = _Parameters(self.drive_map, dictionary)
-        for entry in (*_modes(self.modes, dictionary, own, parameters.choose), *parameters.entries()):
+        for entry in (*_modes(self.modes, dictionary, modes, parameters.choose), *parameters.entries()):
             dictionary.show(entry)
 
     def attach(self, dictionary: Dictionary, plant: Plant, power: PowerDrive, schedule: Schedule) -> None:
@@ -186,12 +194,16 @@ class Reduced:
 
 
 def _modes(
-    modes: Sequence[Mode], dictionary: Dictionary, own: Sequence[int] = (), chosen: Callable[[], None] = lambda: None
+    modes: Sequence[Mode],
+    dictionary: Dictionary,
+    own: Mapping[int, Mode] = MappingProxyType({}),
+    chosen: Callable[[], None] = lambda: None,
 ) -> Iterator[Entry]:
     """Yield the objects of the modes of operation, without those the drive does not have.
 
     Torque with the master's commutation angle is the reference drive's current set-point at a fixed angle; a mode of
-    the maker's ``own`` is its identification mode without any set-point. ``chosen`` is told of every choice.
+    the maker's ``own`` is one of the reference drive's (identification: without any set-point). ``chosen`` is told of
+    every choice.
     """
     inner = dictionary["cia402.mode"]
     shown = Entry(_row(0x6060, 0, "INTEGER8", "Modes of operation", "rw", "R", True), 0)
@@ -201,7 +213,7 @@ def _modes(
         mode = int.from_bytes(data, "little", signed=True)
         if mode not in (Mode.NONE, *modes, *own):
             raise Refused(AbortCode.VALUE)
-        behind = Mode.IDENTIFICATION if mode in (Mode.CYCLIC_TORQUE_ANGLE, *own) else mode
+        behind = own.get(mode, Mode.IDENTIFICATION if mode == Mode.CYCLIC_TORQUE_ANGLE else mode)
         dictionary.write(inner, inner.encode(behind))
         shown.value = data
         chosen()
@@ -350,6 +362,41 @@ class _Parameters:
                 continue  # kept for the family, without effect on the drive behind
             inner = self._dictionary[name]
             self._dictionary.write(inner, inner.encode(value))
+
+
+def _motion_entry(name: str, row: MotionObject, dictionary: Dictionary) -> Entry:
+    """Return the maker's own object of a current or of the encoder's counts.
+
+    Amperes that no source says to be peak or rms are rms, as those of the rated current; torque counts as current.
+    """
+    takes = name in ("rated_current", "current_limit", "target_current")
+    entry = Entry(_row(row.index, row.sub, row.wire, name, "rw" if takes else "ro", "R" if takes else "T", False), 0)
+    base, rated = dictionary[BEHIND[name]], dictionary["cia402.rated_current"]
+
+    def per_count() -> float:
+        """Return what one count of the standard's object is worth, as the row counts (A peak, counts of a turn)."""
+        if name in ("current", "counts_per_turn"):
+            return 1.0
+        return 1e-3 * math.sqrt(2.0) * (1.0 if name == "rated_current" else 1e-3 * rated.number())
+
+    kept: dict[bytes, bytes] = {}
+
+    def sink(data: bytes) -> None:
+        number = entry.code.unpack(data)[0] if entry.code is not None else 0.0
+        dictionary.write(base, base.encode(number * row.per_count / per_count()))
+        kept.clear()
+        kept[base.value] = bytes(data)
+
+    def source() -> bytes:
+        held = base.number() * per_count()
+        if name == "current_limit":  # as the maker's tool leaves it: that of the motor
+            held = min(held, dictionary["motor.I_max_apk"].number())
+        return kept.get(base.value) or entry.encode(held / row.per_count)
+
+    entry.source = source
+    if takes:
+        entry.sink = sink
+    return entry
 
 
 def _signal_entry(name: str, signal: SignalCell, dictionary: Dictionary) -> Entry:
