@@ -397,10 +397,12 @@ static void run_substeps(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_curren
 }
 
 /* The resistor across the flux voltage: of this instant in the averaged model, of the last whole period with ripple,
- * which it would show in every sample of a zero vector; none with a leg open, or with the gates off. */
-static void find_iron_current(const pmsm_inverter *inverter, pmsm_plant *plant)
+ * which it would show in every sample of a zero vector; none with a leg open, or with the gates off. It moved there
+ * over the period, not at its end: else a sensor with any lag showed it a period late. */
+static void find_iron_current(const pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag)
 {
     const uint32_t *open = inverter->setup.open;
+    const double alpha = plant->iron_alpha, beta = plant->iron_beta;
     if (!inverter->gates || open[0] || open[1] || open[2])
         plant->iron_alpha = plant->iron_beta = 0.0;
     else if (inverter->setup.model == PMSM_INVERTER_AVERAGED)
@@ -408,6 +410,12 @@ static void find_iron_current(const pmsm_inverter *inverter, pmsm_plant *plant)
     else if (inverter->elapsed >= inverter->T_s)
         pmsm_plant_set_iron_current(plant, inverter->volt_seconds_alpha / inverter->elapsed,
                                     inverter->volt_seconds_beta / inverter->elapsed);
+    if (lag) {
+        const double behind = lag->tau / inverter->T_s, seen = 1.0 - behind * (1.0 - pmsm_real64_exp(-1.0 / behind));
+        for (int x = 0; x < 3; x++)
+            lag->value[x] += seen * (pmsm_leg_alpha[x] * (plant->iron_alpha - alpha)
+                                     + pmsm_leg_beta[x] * (plant->iron_beta - beta));
+    }
 }
 
 void pmsm_inverter_run(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_lag *lag, double t_from, double t_to)
@@ -430,7 +438,7 @@ void pmsm_inverter_run(pmsm_inverter *inverter, pmsm_plant *plant, pmsm_current_
     }
     inverter->elapsed = t_to;
     if (plant->machine.R_iron > 0.0)
-        find_iron_current(inverter, plant);
+        find_iron_current(inverter, plant, active);
 }
 
 double pmsm_inverter_smallest_capacitance(double dead_time, double L_min)
