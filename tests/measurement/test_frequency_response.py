@@ -217,8 +217,13 @@ def test_pushes_that_tell_another_inertia_are_believed_only_where_a_small_torque
     none, loose, beside = of_no_rigid_shaft(Pushed(0.0320, 0.0315), response)  # of the means, no fit to a play
     assert none is None and loose["J_kgm2"].value == 0.0315 and loose["J_kgm2"].fallback.startswith(PLAY_FALLBACK)
     assert beside is not None and beside.inertia is None and not beside.found and "play" in beside.reason
-    lighter, nowhere, doubted = of_no_rigid_shaft(Pushed(0.0150, 0.0), response)
-    assert lighter is None and not nowhere and doubted is not None and doubted.inertia is None
+    lighter, means, doubted = of_no_rigid_shaft(Pushed(0.0140, 0.0142), response)  # both inertias are in its interval
+    assert lighter is None and doubted is not None and doubted.inertia is None and not doubted.found
+    assert means["J_kgm2"].value == 0.0142 and means["J_kgm2"].fallback.startswith(MEAN_FALLBACK)
+    apart = 1.0 / 7.0  # of the small torque's, 0.0160: more than the 8 % that the means have by themselves
+    assert {
+        key: 0.99 * apart < total_half_width(e) / e.value < 2.0 * apart for key, e in means.items()
+    } == dict.fromkeys(("J_kgm2", "B_nms", "tau_c_nm"), True)
     _, means, missed = of_no_rigid_shaft(Swinging(0.0, 0.0120), replace(response, found={}))
     mean = means["J_kgm2"]
     assert mean.value == 0.0120 and mean.fallback.startswith(MEAN_FALLBACK) and "swings at 140 Hz" in mean.fallback
