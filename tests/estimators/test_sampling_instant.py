@@ -220,3 +220,5 @@ def test_just_beyond_the_grid_the_distance_goes_on() -> None:
         assert shown.distance(delay, 0.0) == pytest.approx((1.0 - delay) / 0.01)
     late = [shown.distance(delay, 0.0) for delay in (1.0601, 1.0701, 1.3, 3.0)]
     assert late[1] - late[0] < -0.5 and late[2] > -9.0 and late[3] > -9.0, "what lies far outside is no instant"
+    assert [shown.outside(delay) for delay in (1.05, 0.77, 1.07, 1.75, 0.7)] == pytest.approx([0, 0, 0.01, 0.69, 0.06])
+    assert [shown.knows(delay) for delay in (1.05, 1.08, 1.1, 0.74, 0.72)] == [True, True, False, True, False]

@@ -170,7 +170,12 @@ class ShownInstant:
 
     def knows(self, delay: float) -> bool:
         """Whether a delay (T_s) stands for an instant of the prediction, or for one at most an interval beside it."""
-        return abs(_place(INSTANTS, self.sampling(delay, 0.0).instant_s / self.period_s)[1] - 0.5) <= 1.0
+        return self.outside(delay) <= INSTANTS[1] - INSTANTS[0]
+
+    def outside(self, delay: float) -> float:
+        """Return how far a delay (T_s) lies from those of the prediction's instants (T_s)."""
+        late = self.sampling(delay, 0.0).instant_s / self.period_s
+        return max(INSTANTS[0] - late, late - INSTANTS[-1], 0.0)
 
     def distance(self, delay: float, lag_s: float) -> float:
         """Whitened distance of a delay (T_s) and a lag from what is shown."""
