@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -46,6 +47,27 @@ def test_a_shot_is_recorded_until_the_rotor_stands_still(
     assert {plan.samples for plan in plans} == {whole_periods(9)}, "few samples are enough, few periods are not"
     assert [plan.lead_s for plan in plans] == pytest.approx([lead * PLAN.lead_s for lead in LEADS[:recorded]])
     assert math.degrees(float(shot["theta_M_rad"][-1])) * PAIRS == pytest.approx(ways_deg[recorded - 1])
+
+
+def test_a_loop_for_the_runs_takes_the_smaller_of_two_rough_inductances(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half periods of 6 and 9 samples showed 0.86 and 1.6 L: decoupled by 1.6 L, the drive tripped at speed."""
+    ripples = {6: 2.0, 9: 1.5}
+
+    def shot(self: SquareStage, name: str, *rest: Any) -> str:
+        return name
+
+    monkeypatch.setattr(SquareStage, "_hold_stable_bias", lambda self, plan, *_: plan)
+    monkeypatch.setattr(SquareStage, "_further_angles", lambda self, plan, *_: plan)
+    monkeypatch.setattr(SquareStage, "_shot", shot)
+    monkeypatch.setattr(square_injection, "find_amplitude", lambda *_: 10.0)
+    monkeypatch.setattr(square_injection, "ripple_of", lambda name, axis: ripples[int(name.split("_")[-1])])
+    monkeypatch.setattr(square_injection, "slow_half_period", lambda *_: 0)
+    R = Estimate(0.9, 1e-3, 0.01, "ohm")
+    resistance = ResistanceResult(R, R, InverterCurve(np.ones(1), np.zeros(1), 0.0), 0.0, 0.0, Verdict.PASS)
+    drive = Mock(period_s=1e-4)
+    stage = SquareStage(drive, Mock(I_test_apk=10.0, V_max_v=20.0), print, print, ripple_share=0.25)  # type: ignore[arg-type]
+    assert PLAN.half_periods == (6, 9)
+    assert stage.measure(Mock(), resistance, ENCODER) == pytest.approx((3e-3, 3e-3))  # 10 V * 6 * 0.1 ms / 2 A
 
 
 @pytest.mark.parametrize(("plateau_v", "knee_a"), [(5e-4, 0.5), (5.0, 2.0)])
