@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import datetime
 import math
 from typing import TYPE_CHECKING
@@ -35,26 +34,33 @@ def carry_out(
 ) -> None:
     """Plan, ask, write, print; the download is put into ``jobs`` (``flash.download.set_named``)."""
     from pmsmtool.errors import CheckFailed
+    from pmsmtool.flash.restore import plan_download, tell_lacking
+
+    if dry_run or check:
+        identity, plan = checked_identity(node, out), plan_download(node, wanted)
+        out.result(command, {"identity": identity, **plan.facts()}, plan.lines())
+        if check and plan.changes:
+            different = f"the drive differs in {counted(len(plan.changes), 'object')}"
+            raise CheckFailed(different, where=f"node {node.node}", hint="run without --check to write them")
+        return
+    identity, plan, outcome = flashed(node, jobs, wanted, bus, motion, out, store=store)
+    out.result(command, {"identity": identity, **plan.facts(), "outcome": outcome}, [told(outcome, node)])
+    tell_lacking(node, plan)
+
+
+def flashed(
+    node: DriveNode, jobs: list[Download], wanted: ParameterSet, bus: BusOptions, motion: MotionOptions, out: Output,
+    *, store: bool | None = None,
+) -> tuple[Identity, Plan, Outcome]:  # fmt: skip
+    """Plan, ask and write; return the drive, the plan and what became of it."""
     from pmsmtool.flash.journal import JournalFolder
-    from pmsmtool.flash.restore import marks_of, plan_download, tell_lacking
+    from pmsmtool.flash.restore import marks_of, plan_download
 
     identity = checked_identity(node, out)
-    looking = dry_run or check
-    with contextlib.nullcontext() if looking else JournalFolder(identity).preparing():
+    with JournalFolder(identity).preparing():
         plan = plan_download(node, wanted)
-        if looking:
-            out.result(command, {"identity": identity, **plan.facts()}, plan.lines())
-            if check and plan.changes:
-                raise CheckFailed(
-                    f"the drive differs in {counted(len(plan.changes), 'object')}",
-                    where=f"node {node.node}",
-                    hint="run without --check to write them",
-                )
-            return
         marks = marks_of(plan.content, datetime.datetime.now())
-        outcome = write_plan(node, jobs, identity, plan, marks, bus, motion, out, store=store)
-        out.result(command, {"identity": identity, **plan.facts(), "outcome": outcome}, [told(outcome, node)])
-        tell_lacking(node, plan)
+        return identity, plan, write_plan(node, jobs, identity, plan, marks, bus, motion, out, store=store)
 
 
 def write_plan(

@@ -4,21 +4,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from pmsmtool.axis.design import move_peaks, profile_within
-from pmsmtool.axis.drive import AxisRequest, axis_path, cases, held_loop
+from pmsmtool.axis.drive import PROFILE, AxisRequest, axis_path, cases, held_loop
 from pmsmtool.axis.loops import AxisGains
-from pmsmtool.axis.move import Profile, plan
+from pmsmtool.axis.move import UNITS, MoveResult, Profile, plan, shown
 from pmsmtool.axis.search import Box
 from pmsmtool.commissioning.axis_design import axis_drive
+from pmsmtool.commissioning.compared_stage import refuse_inertia
+from pmsmtool.commissioning.contradiction import flux_doubt
 from pmsmtool.design.design_file import Design
 from pmsmtool.drive.envelope import largest_torque
+from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError
+from pmsmtool.identification.completed_machine import PER_PSI, completed_machine
+from pmsmtool.identification.move_mechanics import move_mechanics
+from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.two_masses import mechanics_of
+from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.run_directory import RunDirectory, Stage
+from pmsmtool.trace import Trace
+from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 
+SPEED, UP, DOWN, JERK = PROFILE
 HELD, DESIGNED = "that the drive holds", "of the design"
 
 
@@ -104,3 +116,64 @@ def foretold_move(
     apart = path.T * abs(move.distance) / move.t_speed
     torque = abs(machine.torque_nm(0.0, i_max_apk))
     return ForetoldMove(min(errors), max(errors) + apart, whose, max(torques), torque)
+
+
+def asked_profile(limits: Profile | None, speed_rad_s: float | None, acceleration: float | None) -> dict[str, float]:
+    """Return the limits of the move by catalogue name: those of a design, or those that are asked for."""
+    given = (speed_rad_s, acceleration, None) if limits is None else (limits.speed, limits.acceleration, limits.jerk)
+    rows = ((SPEED,), (UP, DOWN), (JERK,))
+    return {name: rpm_from_rad_s(value) for value, names in zip(given, rows, strict=True) if value for name in names}
+
+
+def lent_profile(
+    drive: PositionDrive, profile: Mapping[str, float]
+) -> tuple[dict[str, float], tuple[float, float] | None]:
+    """Return what of a profile this drive can be lent by its map, and what is to be found by its demand (rad/s).
+
+    Raises ConfigError: the map lacks units, and speed or acceleration is not given.
+    """
+    cells = drive.node.map.cells
+    if not profile or all(name in cells for name in profile if name != JERK):
+        return {name: value for name, value in profile.items() if name in cells}, None
+    if not {SPEED, UP} <= set(profile):
+        lacks = f"the map {drive.node.map.name!r} lacks units of the profile"
+        raise ConfigError(lacks, hint="give both --speed and --acceleration")
+    return {}, (rad_s_from_rpm(profile[SPEED]), rad_s_from_rpm(profile[UP]))
+
+
+def move_stage(
+    found: MoveResult,
+    gains: Mapping[str, float],
+    foretold: ForetoldMove | None,
+    seconds: float,
+    doubts: Sequence[str],
+    trace: str,
+) -> Stage:
+    """Return a move as its run keeps it; ``gains`` by catalogue name, ``trace`` its file."""
+    values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]
+    values += [{"name": name, "value": value, "unit": BY_NAME[name].unit} for name, value in gains.items()]
+    summary = f"following error at most {shown(found.error_peak_rad, 'rad')}"
+    if foretold:
+        values += foretold.rows()
+        summary += f" (predicted: {foretold})"
+    return Stage(
+        "move", "pass", seconds, values=values, files={trace: ""}, fallbacks=doubts,
+        summary=f"{summary}, settling: {shown(found.settling_s, 's')}",
+    )  # fmt: skip
+
+
+def moved_machine(
+    source: MachineFile, trace: Trace, drive: PositionDrive, run: RunDirectory
+) -> tuple[MachineFile, dict[str, Estimate]]:
+    """Find inertia and friction from moves, keep the machine file in the run, and return it with what was found.
+
+    Raises Contradiction: less inertia than the machine file allows; IdentificationError: the moves do not show it.
+    """
+    ratios = move_mechanics(
+        trace, pole_pairs=source.machine.pole_pairs, undecided=drive.current_undecided, rated_apk=drive.rated_apk
+    )
+    refuse_inertia(source, ratios["J_per_psi"], run)
+    made = completed_machine(source, ratios, "as given", flux_doubt(source)).machine
+    assert made is not None
+    run.save("machine.toml", dump_machine_file(made))
+    return made, {name: made.estimates[name] for ratio, name in PER_PSI.items() if ratio in ratios}

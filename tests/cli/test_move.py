@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,9 @@ import pytest
 from pmsmtool.arrays import Array
 from pmsmtool.axis.drive import PID
 from pmsmtool.axis.move import mirrored, trapezoid_of
+from pmsmtool.commissioning import designed_move
+from pmsmtool.errors import LimitExceeded
+from pmsmtool.experiments import move as experiments_move
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.trace import Trace, read_trace
@@ -88,19 +92,53 @@ def test_the_same_move_with_stored_and_with_new_gains(tool: Tool, drive: Sequenc
 
 @pytest.mark.chain
 @pytest.mark.parametrize(("family", "gain", "most"), [("ingenia", "position.K_p_per_s", 0.2), ("epos4", PID[0], 0.4)])
-def test_the_axis_of_a_family_without_its_file(tool: Tool, tmp_path: Path, family: str, gain: str, most: float) -> None:
+def test_one_command_moves_with_the_stored_and_the_designed_gains(
+    tool: Tool, tmp_path: Path, family: str, gain: str, most: float
+) -> None:
     """`--sim NAME?drive=FAMILY` is what the documents rehearse with. Measured 0.09 and 0.23 of the stored error."""
     drive = ("--map", family, "--sim", f"interior-2k2?drive={family}&nv={tmp_path / 'face.nv'}", "--yes")
-    asked = ("--by", "60deg", "--speed", "300rpm", "--acceleration", "300", "--settle", "0.2s", *drive, "--json")
-    before = json.loads(tool("move", *asked)[1])
-    assert before["profile"] is None  # the map has the units of the profile
     assert tool("tune", "interior-2k2", "-o", "axis.toml", "--axis", "--map", family)[0] == 0
-    assert tool("flash-params", "axis.toml", *drive)[0] == 0
-    after = json.loads(tool("move", *asked)[1])
+    asked = ("--by", "60deg", "--speed", "300rpm", "--acceleration", "300", "--settle", "0.2s", *drive)
+    code, printed, said = tool("move", *asked, "--design", "axis.toml", "--flash", "--json")
+    assert code == 0, said
+    after = json.loads(printed)
+    before = after["before"]
+    assert before["profile"] is None  # the map has the units of the profile
     assert after["move"]["error_peak_rad"] < most * before["move"]["error_peak_rad"]
     assert after["gains"][gain] > before["gains"][gain] > 0.0
+    # one consent is in both records, and says before the first move that there is another
+    consents = [RunDirectory(Path(one["run"])).read().consents for one in (before, after)]
+    assert consents[0] == consents[1] and [given["subject"] for given in consents[0]] == ["motion"]
+    assert consents[0][0]["text"][-1] == "then the values of axis.toml are written, once you agree, and it moves again"
+    assert said.count("deg and back with the drive's own position loop") == 1
     # the drive's own speed loop has its own gains again: a step of the speed is followed as before the moves
     assert tool("verify", "axis.params.toml", *drive[:-1])[0] == 0
+
+
+@pytest.mark.chain
+@pytest.mark.parametrize("other", [False, True])
+def test_gains_that_cannot_do_a_move_are_told_and_the_next_may(
+    tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, other: bool
+) -> None:
+    """Values are written all the same, once a person agrees; another move than was agreed to is asked for again."""
+    drive = ("--map", "epos4", "--sim", f"interior-2k2?drive=epos4&nv={tmp_path / 'face.nv'}", "--yes")
+    assert tool("tune", "interior-2k2", "-o", "axis.toml", "--axis", "--map", "epos4")[0] == 0
+
+    def ended(*given: Any) -> None:
+        raise LimitExceeded("following error", 1.0, 0.5, "rad")
+
+    monkeypatch.setattr(experiments_move, "record_move", ended)
+    lent: Any = iter([({}, None), ({}, (1.0, 1.0) if other else None)])
+    monkeypatch.setattr(designed_move, "lent_profile", lambda drive, profile: next(lent))
+    asked = ("move", "--by", "60deg", "--speed", "300rpm", "--acceleration", "300", "--design", "axis.toml", *drive)
+    code, printed, said = tool(*asked, "--flash", "--json")
+    found = json.loads(printed)
+    assert code == 5 and found["before"] is None and found["move"] is None
+    assert "the drive's own gains cannot do this move: following error 1 rad" in said
+    assert said.count("deg and back with the drive's own position loop") == 1 + other
+    assert tool("verify", "axis.params.toml", *drive[:-1])[0] == 0
+    code, _, said = tool("move", "--by", "60deg", "--flash", *drive)
+    assert code == 2 and "--flash writes the values of --design" in said
 
 
 def test_a_loop_without_gains_is_named(tool: Tool) -> None:
