@@ -107,7 +107,7 @@ def unknown_firmware(drive_map: DriveMap, identity: Identity) -> str:
     if drive_map.staging or not drive_map.scales or identity.revision >> 16 in rows.revisions:
         return ""
     known = ", ".join(f"{number:#06x}" for number in rows.revisions)
-    says = f"describe {known} ({rows.source}: {drive_map.sources[rows.source]})" if known else "do not say for which"
+    says = f"({rows.source!r}) describe {known}" if known else "do not say for which"
     return (
         f"firmware {identity.revision:#010x} (0x1018:03) of family {drive_map.name}: the map's sources {says}; "
         "compare types and units with your manual"
