@@ -15,6 +15,7 @@ from pmsmtool.cli.output import Output, table
 from pmsmtool.plain_text import by_reason
 
 if TYPE_CHECKING:
+    from pmsmtool.design.tune_request import TuneRequest
     from pmsmtool.measurement.capabilities import Capabilities, Row
 
 
@@ -57,11 +58,9 @@ def caps_command(bus: BusOptions, out: Output, machine: Path | None, map_file: P
         assumed = assumptions_of(eds, None if machine is None else load_machine_file(machine))
     with open_node(bus, within_s=LOOKING_S) as node:
         found = examine(node, given, may_try=eds is not None)
-    refused = {} if machine is None or eds is None or not found.map_is_drives else _refused(machine, eds, found)
+    refused = refused_of_design(machine, eds, found, out)
     facts = {**_facts(found), **({"refused": refused} if machine is not None else {})}
     out.result("caps", facts, lambda: _lines(found, out.verbosity > 0, asked=eds is None))
-    for name, why in refused.items():
-        out.warn(f"of the design of {machine} this drive refuses {name}: {why}")
     for name, why in found.drive_map.not_written(BY_NAME).items():
         if name not in found.drive_map.left_out:
             out.detail(f"not written: {name}: {why}")
@@ -81,13 +80,26 @@ def caps_command(bus: BusOptions, out: Output, machine: Path | None, map_file: P
         out.warn(firmware)
 
 
-def _refused(machine: Path, eds: str, found: Capabilities) -> dict[str, str]:
+def refused_of_design(
+    machine: Path | None, eds: str | None, found: Capabilities, out: Output, request: TuneRequest | None = None
+) -> dict[str, str]:
+    """Say which values of a machine's design (the usual one) the drive of a file refuses, and why; return them."""
+    if machine is None or eds is None or not found.map_is_drives:
+        return {}
     from pmsmtool.commissioning.axis_design import refused_by_limits
+    from pmsmtool.errors import PmsmtoolError
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.sim.foreign.file_rows import read_makers_objects
 
     limits = {at: row.bounds for at, row in read_makers_objects(eds).rows.items()}
-    return refused_by_limits(load_machine_file(machine), found.drive_map, limits)
+    try:
+        refused = refused_by_limits(load_machine_file(machine), found.drive_map, limits, request)
+    except PmsmtoolError as error:
+        out.warn(f"whether this drive holds a design of {machine} is not known: {error.what}")
+        return {}
+    for name, why in refused.items():
+        out.warn(f"of the design of {machine} this drive refuses {name}: {why}")
+    return refused
 
 
 def _facts(found: Capabilities) -> dict[str, Any]:

@@ -121,6 +121,7 @@ def commission_command(
     criterion is not met, a stage of --require is missing, or the design ends below the machine's rated current or
     speed, else PARTIAL (exit 10), with the reason for every stage that did not run.
     """
+    from pmsmtool.cli.caps import refused_of_design
     from pmsmtool.cli.consent import refuse_unattended
     from pmsmtool.commissioning.commission import Commissioning
     from pmsmtool.commissioning.compared_stage import check_accepted
@@ -174,6 +175,7 @@ def commission_command(
         chain.require, chain.accept_limits = require, accept_limits
         for line in chain.stages.plan_lines():
             out.note(line)
+        refused_of_design(machine, eds, found, out, asked["tune"])
         with _reported(run, out, fresh=begun is None):
             chain.carry_out()
 

@@ -87,13 +87,17 @@ def held_design(design: Design, drive_map: DriveMap) -> Design:
 
 
 def refused_by_limits(
-    source: MachineFile, drive_map: DriveMap, limits: Mapping[tuple[int, int], tuple[float, float]]
+    source: MachineFile,
+    drive_map: DriveMap,
+    limits: Mapping[tuple[int, int], tuple[float, float]],
+    request: TuneRequest | None = None,
 ) -> dict[str, str]:
-    """Return which values of the usual design of a machine a drive with such limits refuses, and why.
+    """Return which values of a machine's design (the usual one) a drive with such limits refuses, and why.
 
-    Raises DesignInfeasible: the machine has no design.
+    Raises ConfigError, DesignInfeasible: the machine has no such design.
     """
-    made = held_design(tune(source, TuneRequest()), drive_map).parameter_set()
+    asked = replace(request or TuneRequest(), governor="off", field_weakening="off", predictor=False)  # no such objects
+    made = held_design(tune(source, asked), drive_map).parameter_set()
     return drive_map.limited(limits).refused(without_assumed(drive_map, made)[0])
 
 

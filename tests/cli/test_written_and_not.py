@@ -7,14 +7,17 @@ import csv
 import io
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
 from pmsmtool.cli.main import run
+from pmsmtool.commissioning import axis_design
 from pmsmtool.drive_maps.drive_map_file import map_hash
 from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.drive_maps.sheet_check import map_of_sheet
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
+from pmsmtool.errors import DesignInfeasible
 from pmsmtool.params.catalogue import BY_NAME, OWN_SCALES
 from pmsmtool.params.parameter_set import ParameterSet
 from tests.foreign.data_sheets import Row, copley, epos4, write_eds
@@ -180,14 +183,24 @@ def test_a_makers_file_is_a_map_with_its_limits(home: Path, capsys: pytest.Captu
     assert TOO_MUCH.replace(": ", " -> ", 1) in capsys.readouterr().err and not (home / "out.dcf").exists()
 
 
-def test_caps_names_what_of_a_design_is_refused(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Before a bus is opened."""
-    for limits, refused in (({}, set()), (LIMITS, {"current.K_p_q_v_per_a", "current.K_i_q_v_per_as"})):
-        path = write_eds(home / "theirs.eds", epos4(), limits)
+@pytest.mark.chain
+def test_what_of_a_design_is_refused_is_named_before_a_bus_is_opened(
+    home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    limits = {(0x30A0, 1): (0, 100_000_000), (0x30A0, 2): (0, 10_000_000)}
+    for given, refused in (({}, set()), (limits, {"current.K_p_q_v_per_a", "current.K_i_q_v_per_as"})):
+        path = write_eds(home / "theirs.eds", epos4(), given)
         assert run(["caps", "interior-2k2", "--eds", str(path), "--json"]) == 0
         told = capsys.readouterr()
         assert set(json.loads(told.out)["refused"]) == refused
         assert told.err.count("of the design of interior-2k2 this drive refuses") == len(refused)
+    asked = ["commission", "interior-2k2", "--eds", str(path), "--speed-max", "400rpm"]  # nobody to consent
+    assert run(asked) == 7 and capsys.readouterr().err.count("this drive refuses current.K_") == 2
+    assert run([*asked, "--bandwidth-hz", "300"]) == 7 and "this drive refuses" not in capsys.readouterr().err
+    infeasible = Mock(side_effect=DesignInfeasible("no gains have these margins"))
+    monkeypatch.setattr(axis_design, "refused_by_limits", infeasible)
+    assert run(["caps", "interior-2k2", "--eds", str(path)]) == 0
+    assert "a design of interior-2k2 is not known: no gains have these margins" in capsys.readouterr().err
 
 
 def test_a_value_counted_by_another_has_its_reason_in_the_table(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
