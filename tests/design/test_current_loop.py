@@ -95,6 +95,20 @@ def test_the_loop_is_marginal_exactly_at_its_margins(gains: CurrentGains, delay:
     assert found.delay_margin_s / T_S == pytest.approx(largest - delay, rel=0.02)
 
 
+def test_the_largest_delay_of_a_slow_loop_needs_no_poles_of_hundreds_of_periods(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """`tune --bandwidth-hz 6` took a minute: each trial of the delay was an eigenvalue problem of 400 rows."""
+    asked: list[int] = []
+    poles = SampledLoop.closed_loop_poles
+    monkeypatch.setattr(SampledLoop, "closed_loop_poles", lambda loop: (asked.append(len(loop.den)), poles(loop))[1])
+    plant = AxisPlant(R=3.6, L=0.051, T_s=1.0 / 12000.0, delay_periods=1.5)
+    for rad_s, periods in ((120.0, 157.2952), (50.0, 377.0289)):  # by the poles, which took 0.4 and 34 s
+        found = maximum_delay_periods(CurrentGains(rad_s * plant.L, rad_s * plant.R), plant)
+        assert found == pytest.approx(periods, rel=2e-4)
+    assert max(asked) < 10
+
+
 def test_the_largest_delay_is_the_first_limit_though_the_loop_is_stable_again_beyond() -> None:
     """A predictor made for two periods: unstable from 2.19 to 2.81, stable to 2.95, unstable from there on."""
     plant = AxisPlant(R=2.2785e-3, L=0.42428e-3, T_s=152.03e-6, delay_periods=2.0)

@@ -16,12 +16,15 @@ from enum import StrEnum
 import numpy as np
 
 from pmsmtool.arrays import Array
-from pmsmtool.design.loops.sampled_loop import SampledLoop
+from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.errors import DesignInfeasible
 
 HOLD_PERIODS = 0.5
 """Mean delay of the zero-order hold itself, in periods."""
 
+MANY_PERIODS = 100.0
+"""Delay in periods beyond which phase margin over crossover is exact enough: at most 1.4e-4 off in ten loops of 94 to
+377 periods. Poles of so many periods took a minute in a loop of 6 Hz."""
 _DELAY_STEP = 1.125
 """Factor by which the delay grows in search of instability. A loop with predictor may be stable again beyond its first
 limit (to 2.19 periods, and again from 2.81 to 2.95): no larger step than these islands are wide."""
@@ -147,8 +150,9 @@ def axis_loop(gains: CurrentGains, plant: AxisPlant, model: AxisPlant | None = N
 def maximum_delay_periods(gains: CurrentGains, plant: AxisPlant, model: AxisPlant | None = None) -> float:
     """Return the least total delay, in periods, that makes the loop unstable; the plant's own delay is part of it.
 
-    Exact: the pole radius of the loop with fractional delay, enclosed by secants. (Phase margin over crossover is an
-    approximation for a sampled loop.) The plant's present delay is returned when the loop is unstable already.
+    Exact up to ``MANY_PERIODS``: the pole radius of the loop with fractional delay, enclosed by secants. Phase margin
+    over crossover, which is taken beyond, is an approximation for a sampled loop. The plant's present delay is returned
+    when the loop is unstable already.
     """
 
     def excess(delay: float) -> float:
@@ -158,6 +162,9 @@ def maximum_delay_periods(gains: CurrentGains, plant: AxisPlant, model: AxisPlan
     low, f_low = plant.delay_periods, excess(plant.delay_periods)
     if f_low >= 0.0:
         return low
+    around = low + margins(axis_loop(gains, plant, model)).delay_margin_s / plant.T_s
+    if around > MANY_PERIODS:
+        return around
     high = _DELAY_STEP * low
     while (f_high := excess(high)) < 0.0:
         low, f_low, high = high, f_high, _DELAY_STEP * high
