@@ -265,8 +265,12 @@ class SquareStage:
     def _hold_stable_bias(
         self, plan: square_injection.SquarePlan, encoder: EncoderResult, knee_a: float, noise: Noise
     ) -> square_injection.SquarePlan:
-        """Hold the bias, or as much of it as leaves the rotor's d axis on the vector; returns the plan with it."""
+        """Hold the bias, or as much of it as leaves the rotor's d axis on the vector; returns the plan with it.
+
+        A rotor that stands on it is shown beside it by what the encoder errs over a turn, wherever the frame goes.
+        """
         wanted = plan.ripple_a
+        on_rad = BIAS_ON_RAD + encoder.pole_pairs.value * sum(encoder.per_turn_rad)
         floor = NOISE_RIPPLE * noise.sigma_a
         for _ in range(BIAS_TRIES):
             self.say(f"L_d, L_q: square wave on {plan.bias_d_a:.3g} A, {plan.ripple_a:.3g} A peak to peak")
@@ -282,7 +286,7 @@ class SquareStage:
                 aligned = replace(aligned, angle_rad=angle, ripple_a=ripple)
                 square_injection.hold_bias(self.drive, aligned)
                 ahead = self._rotor_ahead(encoder, aligned)
-                if abs(ahead) <= BIAS_ON_RAD:
+                if abs(ahead) <= on_rad:
                     return aligned
             wanted, bias = 0.5 * wanted, 0.5 * plan.bias_d_a
             plan = replace(plan, bias_d_a=bias, ripple_a=max(floor, clear_ripple(wanted, bias, knee_a)))

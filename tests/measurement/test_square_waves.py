@@ -1,16 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""A shot of square waves in which the rotor still moves is recorded again, with a longer lead."""
+"""Square waves: where the frame stands, and a rotor that still moves in a shot."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
+from pmsmtool.estimators.angle_harmonics import Harmonic
+from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.estimate import Verdict
 from pmsmtool.estimators.inverter_error import InverterCurve
@@ -68,6 +71,22 @@ def test_a_loop_for_the_runs_takes_the_smaller_of_two_rough_inductances(monkeypa
     stage = SquareStage(drive, Mock(I_test_apk=10.0, V_max_v=20.0), print, print, ripple_share=0.25)  # type: ignore[arg-type]
     assert PLAN.half_periods == (6, 9)
     assert stage.measure(Mock(), resistance, ENCODER) == pytest.approx((3e-3, 3e-3))  # 10 V * 6 * 0.1 ms / 2 A
+
+
+@pytest.mark.parametrize(("error_deg", "known", "angles_deg"), [(1.1, True, [0.0, 4.4]), (0.4, False, [0.0, 1.6])])
+def test_a_frame_does_not_follow_what_the_encoder_errs(
+    error_deg: float, known: bool, angles_deg: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A rotor that stood on its vector was shown 4 degrees ahead of any: the frame ended at 27, a phase in the knee."""
+    held: list[float] = []
+    monkeypatch.setattr(square_injection, "hold_bias", lambda _, plan: held.append(plan.angle_rad))
+    shown = SimpleNamespace(
+        period_s=1e-4, average=lambda *_: {"theta_m_rad": held[-1] / PAIRS + math.radians(error_deg)}
+    )
+    found = (Harmonic(1, 0.0, math.radians(1.2), 1e-5),) if known else ()
+    stage = SquareStage(shown, None, print, print, ripple_share=0.25)  # type: ignore[arg-type]
+    plan = stage._hold_stable_bias(PLAN, replace(ENCODER, per_turn=found), 0.5, Noise(0.01, 0.0, 0.0))
+    assert plan.angle_rad == held[-1] and np.degrees(held) == pytest.approx(angles_deg)
 
 
 @pytest.mark.parametrize(("plateau_v", "knee_a"), [(5e-4, 0.5), (5.0, 2.0)])
