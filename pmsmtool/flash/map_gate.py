@@ -22,10 +22,12 @@ from pmsmtool.drive_maps.shipped_maps import GENERIC, UNKNOWN_VENDOR, family_of,
 from pmsmtool.errors import ConfigError, SafetyRefusal, SdoAbort
 from pmsmtool.files import ELSEWHERE, make_folder, read_text, write_file
 from pmsmtool.flash.journal import JournalFolder
-from pmsmtool.plain_text import counted
+from pmsmtool.plain_text import counted, one_line
 
 SHOWN = 12
 """Digits of a hash that a message shows."""
+SOURCE_LETTERS = 60
+"""Of a source: the line stands in every plan, and an EPOS4's is four lines long."""
 
 
 def memory_of(folder: JournalFolder) -> Path:
@@ -107,7 +109,8 @@ def unknown_firmware(drive_map: DriveMap, identity: Identity) -> str:
     if drive_map.staging or not drive_map.scales or identity.revision >> 16 in rows.revisions:
         return ""
     known = ", ".join(f"{number:#06x}" for number in rows.revisions)
-    says = f"({rows.source!r}) describe {known}" if known else "do not say for which"
+    source = one_line(drive_map.sources[rows.source], SOURCE_LETTERS) if known else ""
+    says = f"describe {known} ({rows.source}: {source})" if known else "do not say for which"
     return (
         f"firmware {identity.revision:#010x} (0x1018:03) of family {drive_map.name}: the map's sources {says}; "
         "compare types and units with your manual"
