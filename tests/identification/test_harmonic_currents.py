@@ -11,12 +11,17 @@ import numpy as np
 import pytest
 
 from pmsmtool.estimators.current_sensors import Noise
+from pmsmtool.estimators.estimate import SensorTolerance
+from pmsmtool.estimators.flux.linkage import FluxResult
 from pmsmtool.estimators.injection.sampling_instant import Sampling
 from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.identification import evaluate
 from pmsmtool.identification.mechanics import HARMONIC_PARTS, _drag_of_unknown_instant, _harmonic_current
+from pmsmtool.machine.parameters import Estimate
 from pmsmtool.trace import Trace
 
 R, K_P, PSI, PAIRS, SIGMA_A, ROWS = 0.5, (0.8, 1.2), 0.05, 4, 0.01, 4000
+KNOWN = Estimate(1.0, 0.001, 0.0, "1")
 WITHIN = 0.01
 """Relative; measured 0.14 %."""
 
@@ -90,3 +95,25 @@ def test_what_is_not_sure_to_be_the_samples_instant_is_in_the_friction() -> None
     refused = SimpleNamespace(flux=flux, shown=SimpleNamespace(value_s=late_s), inductance=None)
     assert _drag_of_unknown_instant(cast(Any, refused), pole_pairs, L_q) == pytest.approx(0.5 * two)
     assert _drag_of_unknown_instant(cast(Any, refused), pole_pairs, 0.0) == 0.0
+
+
+@pytest.mark.parametrize(("shown_s", "hidden_s"), [(33e-6, 5e-6), (-13e-6, 5e-6), (6e-6, 3e-6), (0.0, 0.0)])
+def test_an_instant_that_eddy_currents_hide_is_in_the_flux_linkage(
+    monkeypatch: pytest.MonkeyPatch, shown_s: float, hidden_s: float
+) -> None:
+    """Half of what the run over speeds shows, at most 5 us: nothing of it is corrected."""
+    psi, per_s = replace(KNOWN, value=0.7), -2000.0  # 0.2 % per us: L/R of 1.6 ms, and a ripple as large as i_d
+
+    def flux_of(*given: Any) -> Any:
+        value = 0.69 * (1.0 + per_s * given[6].instant_s) if len(given) > 6 else 0.0
+        return SimpleNamespace(psi_measured=replace(psi, value=value))
+
+    monkeypatch.setattr(evaluate, "flux_of", flux_of)
+    flux = FluxResult(psi, psi, psi, None, 0.0, psi, 0.0, 0.0, 0.0, 0.0, np.zeros(1), np.zeros(1),
+                      cast(Any, SimpleNamespace(value_s=shown_s)))  # fmt: skip
+    inductance = SimpleNamespace(L_d=psi, L_q=psi, sampling=None)
+    result = evaluate.Evaluation(Noise(SIGMA_A, 0.0, 0.0), flux=flux, inductance=cast(Any, inductance),
+                                 resistance=cast(Any, known().resistance))  # fmt: skip
+    found = evaluate.as_sampled({}, result, 1e-4, 0.0, SensorTolerance()).flux
+    assert found is not None and found.psi_f == found.psi_measured and found.psi_f.value == 0.7
+    assert found.psi_f.std == pytest.approx(np.hypot(0.001, 0.7 * per_s * hidden_s))
