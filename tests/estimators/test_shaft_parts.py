@@ -169,17 +169,18 @@ def test_the_derivative_of_a_run_is_that_of_differences(drag: bool) -> None:
 
 @pytest.mark.parametrize("power", [0.0, 1.0])
 def test_mean_motions_are_a_weighted_regression_of_mean_torques(power: float) -> None:
-    """Parabolas in halves of what moves; a rest at the end is left out."""
+    """Parabolas in halves of what moves; a rest at the end is left out. Errors as shares: pushes are whole."""
     rng = np.random.default_rng(44)
     runs, rows, torques, states = [], [], [], []
-    for a, w in ((40.0, 1.0), (-15.0, 9.0), (-35.0, -2.0), (12.0, -8.0)):
+    for a, w, coasting in ((40.0, 1.0, False), (-15.0, 9.0, True), (-35.0, -2.0, False), (12.0, -8.0, True)):
         t = 0.01 * np.arange(41)
         theta = 0.2 + w * t + 0.5 * a * t**2
         torque = rng.uniform(0.05, 0.1) * np.sign(a)
-        runs.append(_run(theta, np.full(40, torque), 0.01))
+        runs.append(_run(theta, np.full(40, torque), 0.01, coasting=coasting))
         way = np.abs(np.diff(theta))
         moving = max(16, int(np.nonzero(way > 0.2 * np.max(way))[0][-1]) + 1)
-        for part in (slice(0, moving // 2), slice(moving // 2, moving)):
+        half = (moving + 1) // 2
+        for part in (slice(moving),) if power and not coasting else (slice(half), slice(half, moving)):
             omega = w + a * float(np.mean(t[part]))
             rows.append([a, omega, math.copysign(1.0, omega)])
             torques.append(torque)

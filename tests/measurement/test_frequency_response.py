@@ -217,6 +217,11 @@ def test_pushes_that_tell_another_inertia_are_believed_only_where_a_small_torque
     none, loose, beside = of_no_rigid_shaft(Pushed(0.0320, 0.0315), response)  # of the means, no fit to a play
     assert none is None and loose["J_kgm2"].value == 0.0315 and loose["J_kgm2"].fallback.startswith(PLAY_FALLBACK)
     assert beside is not None and beside.inertia is None and not beside.found and "play" in beside.reason
+    kept, *_ = of_no_rigid_shaft(Pushed(0.0162, 0.0125), response)
+    assert kept is not None, "a resonance that was found judges"
+    fitted, means, doubted = of_no_rigid_shaft(Pushed(0.0162, 0.0125), replace(response, found={}))
+    assert fitted is None and means["J_kgm2"].value == 0.0125 and doubted is not None and doubted.inertia is None
+    assert total_half_width(means["J_kgm2"]) > 0.016 - 0.0125, "0.0162 by the fit agrees, 0.0125 by the means does not"
     lighter, means, doubted = of_no_rigid_shaft(Pushed(0.0140, 0.0142), response)  # both inertias are in its interval
     assert lighter is None and doubted is not None and doubted.inertia is None and not doubted.found
     assert means["J_kgm2"].value == 0.0142 and means["J_kgm2"].fallback.startswith(MEAN_FALLBACK)

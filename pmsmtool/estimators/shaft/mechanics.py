@@ -269,17 +269,16 @@ def estimate_mechanics(
 def mean_mechanics(
     runs: Sequence[Trace], torque: Torque, scale_std: float, direction: int, tolerance: SensorTolerance | None = None
 ) -> dict[str, Estimate]:
-    """Return inertia and friction by their keys, from a regression of the mean torques on the mean motions of halves.
+    """Return inertia and friction by their keys, from a regression of mean torques on mean motions.
 
-    Whatever swings or strikes within half a trace is in neither mean. Parameters as of :func:`estimate_mechanics`;
-    nothing where it finds no inertia, and no friction that may be more than what turned the shaft. Nothing drives a
-    shaft the faster it turns: a B below zero is none, and tau_c is what it is without, known no better than with it.
+    Of pushes and halves of coasting: what swings or strikes within is in no mean. As :func:`estimate_mechanics`; no
+    friction that may be more than what turned the shaft, and no B below zero: nothing drives it the faster it turns.
     """
     runs = [_fast(_window(run)) for run in runs]
     step = encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, 0.0, direction, 1, step, NO_HARMONICS, 0.0)[1] for run in runs]
     values, covariance, _ = _mean_motion(blocks, power=1.0)
-    student = coverage_factor(2 * len(runs) - len(values)) / COVERAGE_FACTOR
+    student = coverage_factor(sum(1 + run.coasting for run in blocks) - len(values)) / COVERAGE_FACTOR
     stds = (student * np.sqrt(np.diag(covariance))).tolist()
     if not values[0] > 0.0:
         return {}
@@ -400,7 +399,8 @@ def _start(runs: Sequence[Run]) -> Array:
 def _mean_motion(runs: Sequence[Run], power: float = 0.0) -> tuple[Array, NDArray[np.float64], list[float]]:
     """Return J, B, tau_c of the mean torques and motions of half traces, their covariance, and the first states.
 
-    With a ``power`` of 1 errors are a share of the acceleration: pushes tell J, coasting friction.
+    With a ``power`` of 1 errors are a share of the acceleration (pushes tell J, coasting friction), and a push is
+    whole: half of one was a single swing of the shaft, which made J 34 % too large.
     """
     rows, torques, states = [], [], []
     for run in runs:
@@ -411,7 +411,7 @@ def _mean_motion(runs: Sequence[Run], power: float = 0.0) -> tuple[Array, NDArra
         gain = run.T * np.append(0.0, np.cumsum(run.torque))
         once, twice = (run.T * np.append(0.0, np.cumsum(0.5 * (x[1:] + x[:-1]))) for x in (run.theta, gain))
         ways = np.stack([run.theta, once, twice], axis=1)
-        for part in (slice(0, moving // 2), slice(moving // 2, moving)):
+        for part in np.array_split(np.arange(moving), 1 if power and not run.coasting else 2):
             a, omega, mean = 2.0 * np.polyfit(t[part], ways[part], 2)[0]
             rows.append([a, omega, math.copysign(1.0, omega)])
             torques.append(float(mean))
