@@ -110,7 +110,7 @@ def test_learned_gains_are_the_drawn_ones_and_go_into_a_map(
     bench: Bench, tool: Tool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(learn_gains, "SETTLE_S", 0.4)
-    monkeypatch.setattr(learn_gains, "LEAST_S", 1.2)
+    monkeypatch.setattr(learn_gains, "LEAST_S", 2.4)  # with 1.2 one in a few noises left K_i open
     before = bench.counts()
     code, printed, said = bench.learn(tool, "-o", "mine.toml", "--json")
     assert code == 0, said

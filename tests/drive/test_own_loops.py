@@ -279,16 +279,23 @@ RATED_OPEN = {"rated_current": MotionObject(0x3001, 2, "UNSIGNED16", "mA peak-or
 
 
 @pytest.mark.parametrize(
-    ("rows", "standard", "as_rms"),
+    ("rows", "standard_ma", "as_rms"),
     [
-        ({}, True, True), (PEAK, True, False), (RATED_PEAK, False, False), (RATED_OPEN, False, True),
-        ({**PEAK, **RATED_PEAK}, False, False), (RATED_PEAK, True, True),
+        ({}, 4000, True), (PEAK, 4000, False), (RATED_PEAK, None, False), (RATED_OPEN, None, True),
+        ({**PEAK, **RATED_PEAK}, None, False), (RATED_PEAK, 4000, False), (RATED_PEAK, 2828, False),
+        (RATED_PEAK, 3500, True), (RATED_OPEN, 4000, True),
     ],
 )  # fmt: skip
-def test_whether_the_current_was_taken_as_rms(rows: dict[str, MotionObject], standard: bool, as_rms: bool) -> None:
-    """A share of 0x6075 is, and one of a rated current of undecided kind; the maker's own peak amperes are not."""
-    held = {item: value for item, value in HELD.items() if standard or item is not objects.RATED_CURRENT_MA}
-    with opened({**held, OWN_CURRENT: 0, OWN_RATED: 4000}) as (_, connection):
+def test_whether_the_current_was_taken_as_rms(
+    rows: dict[str, MotionObject], standard_ma: int | None, as_rms: bool
+) -> None:
+    """A share of 0x6075 is, and one of a rated current of undecided kind; the maker's own peak amperes are not.
+
+    4 A peak beside a 0x6075 of 4 A, or of that current rms, tell its kind; beside 3.5 A they tell nothing.
+    """
+    held = {item: value for item, value in HELD.items() if item is not objects.RATED_CURRENT_MA}
+    stated = {} if standard_ma is None else {objects.RATED_CURRENT_MA: standard_ma}
+    with opened({**held, **stated, OWN_CURRENT: 0, OWN_RATED: 4000}) as (_, connection):
         assert SpeedLoopDrive(connection, NODE, drive_map=replace(GENERIC, motion=rows)).read_as_rms == as_rms
 
 

@@ -104,7 +104,10 @@ def test_a_q_current_that_settles_slowly_does_not_stop_the_shaft() -> None:
     assert evaluation.inductance is not None and evaluation.resistance is not None
     latency = evaluation.resistance.R_measured.value * SensorTolerance().encoder_latency_s
     gains = SensorTolerance().impedance * evaluation.inductance.L_d.value
-    expected = math.hypot(gains, latency)
+    half = (
+        0.5 * evaluation.resistance.R_measured.value * max(0.0, instant.value)
+    )  # of what an old angle would make of L
+    expected = math.hypot(gains, latency) + half
     assert evaluation.inductance.L_d.systematic == pytest.approx(expected, rel=5e-3)  # measured 3.3e-3, by the R at T
 
 
