@@ -106,7 +106,7 @@ def _moved(first: Path, second: Path) -> bool:
 
 def _diff_of_moves(first: Path, second: Path, check: bool, out: Output) -> None:
     from pmsmtool.axis.move import compared_moves, demanded, move_result, same_move, shown
-    from pmsmtool.cli.move import TRACE
+    from pmsmtool.commissioning.move import TRACE
     from pmsmtool.errors import CheckFailed, ConfigError
     from pmsmtool.run_directory import RunDirectory
     from pmsmtool.trace import read_trace

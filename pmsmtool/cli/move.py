@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,14 +38,14 @@ from pmsmtool.cli.output import Output, table
 
 if TYPE_CHECKING:
     from pmsmtool.cli.consent import Consent
+    from pmsmtool.commissioning.move import PlannedMove
+    from pmsmtool.drive.position_drive import PositionDrive
+    from pmsmtool.drive_maps.drive_map import DriveMap
+    from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.machine.parameters import Estimate
 
-TRAVEL_MARGIN, SPEED_MARGIN = 1.5, 1.5
-"""Limits over what is asked for: more ends the move. Calm gains of makers' tools go 30 % beyond a way of 60 degrees."""
-ERROR_SHARE = 0.5
-"""Following error at which the voltage is removed, of the way."""
-DURATION_S = 45.0
-TRACE = "traces/move.npz"
+IDENTIFY_TIMES = 4
+"""Moves there and back for inertia and friction: sixteen halves."""
 
 
 @click.command(
@@ -88,114 +90,104 @@ def move_command(
     With --identify: inertia and Coulomb friction of MACHINE from the current of the moves, for a drive without a torque
     mode. They rest on the flux linkage and the pole pairs of MACHINE. Exit code 6 when the moves do not identify them.
     """
-    from pmsmtool.axis.drive import PROFILE
-    from pmsmtool.axis.move import move_result
-    from pmsmtool.cli.consent import ask_motion, keep
     from pmsmtool.cli.flash_session import flashed
-    from pmsmtool.cli.flash_session import told as written
-    from pmsmtool.commissioning.designed_move import (
-        asked_profile,
-        foretold_move,
-        lent_profile,
-        limits_of_move,
-        move_stage,
-        moved_machine,
-    )
+    from pmsmtool.cli.flash_session import told as outcome_line
+    from pmsmtool.commissioning.move import plan_move
     from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.design.design_file import load_design
-    from pmsmtool.drive.envelope import Envelope, largest_acceleration
-    from pmsmtool.drive.guard import guarded
-    from pmsmtool.drive.motion_objects import first_of_axes, held_current_limits, low_limits
-    from pmsmtool.drive.own_limits import refuse_no_current
-    from pmsmtool.drive.position_drive import PositionDrive
+    from pmsmtool.drive.envelope import Envelope
     from pmsmtool.errors import ConfigError, LimitExceeded
-    from pmsmtool.experiments.move import record_move
-    from pmsmtool.files import write_file
     from pmsmtool.flash.download import set_named
-    from pmsmtool.flash.map_gate import check_motion
     from pmsmtool.flash.restore import tell_lacking
-    from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
-    from pmsmtool.params.catalogue import BY_NAME
-    from pmsmtool.plain_text import counted
-    from pmsmtool.trace import trace_npz
-    from pmsmtool.units import rad_s_from_rpm
+    from pmsmtool.machine.machine_file import load_machine_file
 
     if not way_rad:
         raise ConfigError("--by 0 moves nothing", hint="give a way, e.g. --by 90deg")
     if flash and (design is None or machine is not None):
         raise click.UsageError("--flash writes the values of --design, and goes without --identify")
     source = None if machine is None else load_machine_file(machine)
-    times = times or (1 if source is None else IDENTIFY_TIMES)
     drive_map = map_of_drive(bus, map_file)
-    agreed: tuple[Any, Consent] | None = None
-    predicted: list[str] = []
-    made = None if design is None else load_design(design)
+    allowed = Envelope(
+        i_max_apk=motion.i_max_apk or math.inf, speed_max_rad_s=motion.speed_max_rad_s or math.inf,
+        shaft=motion.shaft or "free", load=motion.load, brake=motion.brake,
+    )  # fmt: skip
+    plan = partial(
+        plan_move, allowed=allowed, way_rad=way_rad, times=times or (1 if source is None else IDENTIFY_TIMES),
+        design=None if design is None else load_design(design), speed_rad_s=speed_rad_s, acceleration=acceleration,
+    )  # fmt: skip
+    moves = _Moves(bus, motion, out, runs, drive_map, plan, settle_s, {})
+    if design is None or not flash:
+        data = moves.make(source, path)
+        out.result("move", data, lambda: [*_lines(data), *_told(data["identified"])])
+        return
+    data = {"run": None, "move": None, "before": None}
+    ended: LimitExceeded | None = None
+    try:
+        then = f"then the values of {design} are written, once you agree, and it moves again"
+        data["before"] = moves.make(then=[then])
+    except LimitExceeded as error:
+        out.warn(f"the drive's own gains cannot do this move: {error.what}")
+    with set_named() as jobs, open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
+        _, written, outcome = flashed(node, jobs, load_parameters(design, drive_map), bus, motion, out)
+        out.note(outcome_line(outcome, node))
+    try:
+        data |= moves.make()
+    except LimitExceeded as error:
+        ended = error
+    out.result("move", data, lambda: _lines(data))
+    if ended is not None:
+        raise ended
+    tell_lacking(node, written)
 
-    def moved(after: str = "") -> dict[str, Any]:
-        """Move there and back, keep the run, and return what is told of it."""
-        nonlocal agreed
-        with bus.connect() as connection:
-            drive = PositionDrive(connection, claimed_node(connection, bus.node), drive_map=drive_map)
+
+@dataclass(frozen=True, slots=True)
+class _Moves:
+    """The moves of one command; ``agreed``: the consents that were given, by what each is about."""
+
+    bus: BusOptions
+    motion: MotionOptions
+    out: Output
+    runs: Path
+    drive_map: DriveMap
+    plan: Callable[[PositionDrive], PlannedMove]
+    settle_s: float
+    agreed: dict[object, Consent]
+
+    def make(
+        self, source: MachineFile | None = None, path: Path | None = None, then: Sequence[str] = ()
+    ) -> dict[str, Any]:
+        """Ask unless it is agreed to, move there and back, keep the run, and return what is told of it.
+
+        ``source``: machine whose inertia and friction are found, written to ``path``; ``then``: what follows the move.
+        """
+        from pmsmtool.cli.consent import ask_motion, keep
+        from pmsmtool.commissioning.move import make_move, moved_machine
+        from pmsmtool.drive.position_drive import PositionDrive
+        from pmsmtool.files import write_file
+        from pmsmtool.flash.map_gate import check_motion
+        from pmsmtool.machine.machine_file import dump_machine_file
+
+        out = self.out
+        with self.bus.connect() as connection:
+            drive = PositionDrive(connection, claimed_node(connection, self.bus.node), drive_map=self.drive_map)
             check_motion(drive.node.map, drive.identity)
-            i_max = motion.i_max_apk or drive.current_allowed_apk
-            kept = held_current_limits(drive.node, drive.rated_apk)
-            given = min([i_max, *(apk for _, apk in kept)])
-            refuse_no_current(drive.node, given)
-            limits = None if made is None else limits_of_move(made, given, speed_rad_s, acceleration)
-            profile = asked_profile(limits, speed_rad_s, acceleration)
-            lent, find = lent_profile(drive, profile)
-            speed = profile.get(PROFILE[0]) or (drive.read(PROFILE[0]) if PROFILE[0] in drive.node.map.cells else None)
-            speed_max = motion.speed_max_rad_s or (SPEED_MARGIN * rad_s_from_rpm(speed) if speed else None)
-            if speed_max is None:
-                unknown = "the speed of the drive's own move is not known: its map has no row for it"
-                raise ConfigError(unknown, hint="give --speed and --acceleration, or --speed-max")
-            envelope = Envelope(
-                i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S * times, load=motion.load,
-                travel_rad=TRAVEL_MARGIN * abs(way_rad), shaft=motion.shaft or "free", brake=motion.brake,
-                acceleration_rad_s2=None if made is None else largest_acceleration(made.machine.machine, i_max),
-            )  # fmt: skip
-            envelope.refuse_gravity()
-            gains = drive.held_gains()
-            drive.error_limit_rad = ERROR_SHARE * abs(way_rad)
-            foretold = None
-            if made is not None and limits is not None:
-                foretold = foretold_move(made, drive.node.map, gains, way_rad, limits, given)
-            lines = [
-                *envelope.lines(),
-                *first_of_axes(drive.node),
-                *low_limits(drive.node, drive.rated_apk),
-                f"the shaft moves by {math.degrees(way_rad):.4g} deg and back with the drive's own position loop, "
-                f"{counted(times, 'time')}",
-                f"voltage off where the shaft is {math.degrees(ERROR_SHARE * abs(way_rad)):.3g} deg behind and comes "
-                "no nearer",
-                *(foretold.lines(drive.error_limit_rad) if foretold else []),
-                "before that it turns by a degree with little current, to see that it does not run away",
-                *([] if find is None else ["its profile is found first by slower moves within this way"]),
-                *(f"changed for the move: {name} {value:.5g} {BY_NAME[name].unit}" for name, value in lent.items()),
-                "nothing is stored in the drive; every changed object is restored",
-                *([after] if after else []),
-            ]  # fmt: skip
-            same = (drive.identity.serial, envelope, lent, find)
-            if agreed is None or agreed[0] != same:  # one consent is for both moves, and for nothing else
-                asked = ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
-                agreed = same, asked
+            planned = self.plan(drive)
+            serial, foretold = drive.identity.serial, planned.foretold
+            about = serial, planned.envelope, tuple(planned.lent.items()), planned.find
+            if about not in self.agreed:  # one consent is for both moves, and for nothing else
+                lines = [*planned.lines(drive), *then]
+                self.agreed[about] = ask_motion(
+                    lines, self.motion, simulated=self.bus.simulated(), serial=serial, out=out
+                )
             elif foretold:
-                out.note(foretold.lines(drive.error_limit_rad)[0])
-            run = new_run(bus, drive, runs)
-            keep(run, agreed[1])
-            with guarded(drive, envelope, say=out.note) as guard:
-                guard.write(lent)
-                began = connection.clock.now()
-                trace, counts = record_move(guard, drive, way_rad, settle_s, times, find)
-                seconds = connection.clock.now() - began
-            drive.close()
+                out.note(foretold.lines(planned.error_limit_rad)[0])
+            run = new_run(self.bus, drive, self.runs)
+            keep(run, self.agreed[about])
+            found, counts, trace = make_move(drive, planned, self.settle_s, run, out.note)
         if counts is not None:
             out.note(f"changed for the move: {counts}")
-        run.save(TRACE, trace_npz(trace))
-        found = move_result(trace)
-        for line in (doubts := trace.meta["doubts"]):
+        for line in trace.meta["doubts"]:
             out.warn(line)
-        run.add(move_stage(found, gains, foretold, seconds, doubts, TRACE))
         told: dict[str, Estimate] = {}
         if source is not None:
             completed, told = moved_machine(source, trace, drive, run)
@@ -204,36 +196,9 @@ def move_command(
             if path is not None:
                 write_file(path, dump_machine_file(completed))
                 out.note(f"wrote {path}")
-        predicted[:] = [f"predicted: {foretold}"] if foretold else []
         out.note(f"run: {run.path}")
-        return {"run": run.path, "move": asdict(found), "gains": gains, "lent": lent, "profile": counts,
-                "identified": told, "predicted": foretold and asdict(foretold)}  # fmt: skip
-
-    if design is None or not flash:
-        data = moved()
-        out.result("move", data, lambda: [*_lines(data), *predicted, *_told(data["identified"])])
-        return
-    data = {"run": None, "move": None, "before": None}
-    ended: LimitExceeded | None = None
-    try:
-        data["before"] = moved(f"then the values of {design} are written, once you agree, and it moves again")
-    except LimitExceeded as error:
-        out.warn(f"the drive's own gains cannot do this move: {error.what}")
-    with set_named() as jobs, open_node(bus, drive_map, within_s=WHOLE_SET_S) as node:
-        _, plan, outcome = flashed(node, jobs, load_parameters(design, drive_map), bus, motion, out)
-        out.note(written(outcome, node))
-    try:
-        data |= moved()
-    except LimitExceeded as error:
-        ended = error
-    out.result("move", data, lambda: [*_lines(data), *predicted])
-    if ended is not None:
-        raise ended
-    tell_lacking(node, plan)
-
-
-IDENTIFY_TIMES = 4
-"""Moves there and back for inertia and friction: sixteen halves."""
+        return {"run": run.path, "move": found, "gains": planned.gains, "lent": planned.lent, "profile": counts,
+                "identified": told, "predicted": foretold}  # fmt: skip
 
 
 def _told(found: dict[str, Estimate]) -> list[str]:
@@ -249,10 +214,12 @@ def _lines(data: dict[str, Any]) -> list[str]:
     """Return what a person reads of a move, beside the one before the values were written."""
     from pmsmtool.axis.move import UNITS, shown
 
-    moves = {"before": data["before"], "after": data} if "before" in data else {"value": data}
+    runs = {"before": data["before"], "after": data} if "before" in data else {"value": data}
+    moves = {name: run and run["move"] for name, run in runs.items()}
     rows = [
         (name.rpartition("_")[0] or name,
-         *(shown(one["move"][name], unit) if one and one["move"] else "cannot do it" for one in moves.values()))
+         *(shown(getattr(move, name), unit) if move else "cannot do it" for move in moves.values()))
         for name, unit in UNITS.items()
     ]  # fmt: skip
-    return table(("move", *moves), rows)
+    foretold = data.get("predicted")
+    return [*table(("move", *moves), rows), *([f"predicted: {foretold}"] if foretold else [])]

@@ -16,9 +16,8 @@ import pytest
 from pmsmtool.arrays import Array
 from pmsmtool.axis.drive import PID
 from pmsmtool.axis.move import mirrored, trapezoid_of
-from pmsmtool.commissioning import designed_move
+from pmsmtool.commissioning import move as commissioning_move
 from pmsmtool.errors import LimitExceeded
-from pmsmtool.experiments import move as experiments_move
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.run_directory import RunDirectory
 from pmsmtool.trace import Trace, read_trace
@@ -127,9 +126,9 @@ def test_gains_that_cannot_do_a_move_are_told_and_the_next_may(
     def ended(*given: Any) -> None:
         raise LimitExceeded("following error", 1.0, 0.5, "rad")
 
-    monkeypatch.setattr(experiments_move, "record_move", ended)
+    monkeypatch.setattr(commissioning_move, "record_move", ended)
     lent: Any = iter([({}, None), ({}, (1.0, 1.0) if other else None)])
-    monkeypatch.setattr(designed_move, "lent_profile", lambda drive, profile: next(lent))
+    monkeypatch.setattr(commissioning_move, "lent_profile", lambda drive, profile: next(lent))
     asked = ("move", "--by", "60deg", "--speed", "300rpm", "--acceleration", "300", "--design", "axis.toml", *drive)
     code, printed, said = tool(*asked, "--flash", "--json")
     found = json.loads(printed)

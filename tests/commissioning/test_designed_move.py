@@ -11,7 +11,7 @@ import pytest
 from pmsmtool.axis.drive import PID, AxisRequest
 from pmsmtool.axis.move import Profile
 from pmsmtool.commissioning.axis_design import design_axis
-from pmsmtool.commissioning.designed_move import DESIGNED, HELD, foretold_move, limits_of_move
+from pmsmtool.commissioning.move import DESIGNED, HELD, foretold_move, limits_of_move
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import load_family

@@ -1,37 +1,49 @@
 # SPDX-License-Identifier: MIT
-"""What a design of the axis says of one move before a drive makes it: its limits, following error and torque."""
+"""One move there and back by a drive's position loop: planned, with what a design says of it, made, and kept."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from pmsmtool.axis.design import move_peaks, profile_within
 from pmsmtool.axis.drive import PROFILE, AxisRequest, axis_path, cases, held_loop
 from pmsmtool.axis.loops import AxisGains
-from pmsmtool.axis.move import UNITS, MoveResult, Profile, plan, shown
+from pmsmtool.axis.move import UNITS, MoveResult, Profile, move_result, plan, shown
 from pmsmtool.axis.search import Box
 from pmsmtool.commissioning.axis_design import axis_drive
 from pmsmtool.commissioning.compared_stage import refuse_inertia
 from pmsmtool.commissioning.contradiction import flux_doubt
 from pmsmtool.design.design_file import Design
-from pmsmtool.drive.envelope import largest_torque
+from pmsmtool.drive.envelope import Envelope, largest_acceleration, largest_torque
+from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.motion_objects import first_of_axes, held_current_limits, low_limits
+from pmsmtool.drive.own_limits import refuse_no_current
 from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError
+from pmsmtool.experiments.move import MoveProfile, record_move
 from pmsmtool.identification.completed_machine import PER_PSI, completed_machine
 from pmsmtool.identification.move_mechanics import move_mechanics
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.two_masses import mechanics_of
 from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.plain_text import counted
 from pmsmtool.run_directory import RunDirectory, Stage
-from pmsmtool.trace import Trace
+from pmsmtool.trace import Trace, trace_npz
 from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 
 SPEED, UP, DOWN, JERK = PROFILE
 HELD, DESIGNED = "that the drive holds", "of the design"
+TRAVEL_MARGIN, SPEED_MARGIN = 1.5, 1.5
+"""Limits over what is asked for: more ends the move. Calm gains of makers' tools go 30 % beyond a way of 60 degrees."""
+ERROR_SHARE = 0.5
+"""Following error at which the voltage is removed, of the way."""
+DURATION_S = 45.0
+"""Longest time of a move there and back."""
+TRACE = "traces/move.npz"
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,25 +153,123 @@ def lent_profile(
     return {}, (rad_s_from_rpm(profile[SPEED]), rad_s_from_rpm(profile[UP]))
 
 
-def move_stage(
-    found: MoveResult,
-    gains: Mapping[str, float],
-    foretold: ForetoldMove | None,
-    seconds: float,
-    doubts: Sequence[str],
-    trace: str,
-) -> Stage:
-    """Return a move as its run keeps it; ``gains`` by catalogue name, ``trace`` its file."""
-    values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]
-    values += [{"name": name, "value": value, "unit": BY_NAME[name].unit} for name, value in gains.items()]
-    summary = f"following error at most {shown(found.error_peak_rad, 'rad')}"
-    if foretold:
-        values += foretold.rows()
-        summary += f" (predicted: {foretold})"
-    return Stage(
-        "move", "pass", seconds, values=values, files={trace: ""}, fallbacks=doubts,
-        summary=f"{summary}, settling: {shown(found.settling_s, 's')}",
+@dataclass(frozen=True, slots=True)
+class PlannedMove:
+    """Moves there and back on one drive, before they are made.
+
+    Attributes
+    ----------
+    way_rad, times : float, int
+        Of the shaft (rad), and how often.
+    envelope : Envelope
+        Limits.
+    gains, lent : dict of str to float
+        What the drive holds, and what is changed in it for the moves, by catalogue name.
+    find : tuple of float or None
+        Speed and acceleration (rad/s, rad/s2) for which counts are found by the demand.
+    foretold : ForetoldMove or None
+        What a design says of them.
+    """
+
+    way_rad: float
+    times: int
+    envelope: Envelope
+    gains: dict[str, float]
+    lent: dict[str, float]
+    find: tuple[float, float] | None
+    foretold: ForetoldMove | None
+
+    @property
+    def error_limit_rad(self) -> float:
+        """Following error at which the voltage is removed (rad)."""
+        return ERROR_SHARE * abs(self.way_rad)
+
+    def lines(self, drive: PositionDrive) -> list[str]:
+        """Return what a person agrees to."""
+        return [
+            *self.envelope.lines(),
+            *first_of_axes(drive.node),
+            *low_limits(drive.node, drive.rated_apk),
+            f"the shaft moves by {math.degrees(self.way_rad):.4g} deg and back with the drive's own position "
+            f"loop, {counted(self.times, 'time')}",
+            f"voltage off where the shaft is {math.degrees(self.error_limit_rad):.3g} deg behind and comes no nearer",
+            *(self.foretold.lines(self.error_limit_rad) if self.foretold else []),
+            "before that it turns by a degree with little current, to see that it does not run away",
+            *([] if self.find is None else ["its profile is found first by slower moves within this way"]),
+            *(f"changed for the move: {name} {value:.5g} {BY_NAME[name].unit}" for name, value in self.lent.items()),
+            "nothing is stored in the drive; every changed object is restored",
+        ]
+
+
+def plan_move(
+    drive: PositionDrive, allowed: Envelope, way_rad: float, times: int, design: Design | None,
+    speed_rad_s: float | None, acceleration: float | None,
+) -> PlannedMove:  # fmt: skip
+    """Return the limits of moves on a drive, what is changed for them, and what a design says of them.
+
+    Raises ConfigError: not a design of an axis, or the speed of the move is not known; SafetyRefusal: a gravity load,
+    or a drive that allows no current.
+
+    Parameters
+    ----------
+    allowed : Envelope
+        What a person allows; infinite: the current that the drive allows, and a speed above that of the move.
+    design : Design or None
+        Its limits are those of the move, but for the speed (rad/s) and acceleration (rad/s2) that are given.
+    """
+    node, i_max, speed_max = drive.node, allowed.i_max_apk, allowed.speed_max_rad_s
+    if math.isinf(i_max):
+        i_max = drive.current_allowed_apk
+    given = min([i_max, *(apk for _, apk in held_current_limits(node, drive.rated_apk))])
+    refuse_no_current(node, given)
+    limits = None if design is None else limits_of_move(design, given, speed_rad_s, acceleration)
+    profile = asked_profile(limits, speed_rad_s, acceleration)
+    lent, find = lent_profile(drive, profile)
+    if math.isinf(speed_max):
+        speed = profile.get(SPEED) or (drive.read(SPEED) if SPEED in node.map.cells else None)
+        if not speed:
+            unknown = "the speed of the drive's own move is not known: its map has no row for it"
+            raise ConfigError(unknown, hint="give --speed and --acceleration, or --speed-max")
+        speed_max = SPEED_MARGIN * rad_s_from_rpm(speed)
+    envelope = replace(
+        allowed, i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S * times,
+        travel_rad=TRAVEL_MARGIN * abs(way_rad),
+        acceleration_rad_s2=None if design is None else largest_acceleration(design.machine.machine, i_max),
     )  # fmt: skip
+    envelope.refuse_gravity()
+    gains, foretold = drive.held_gains(), None
+    if design is not None and limits is not None:
+        foretold = foretold_move(design, node.map, gains, way_rad, limits, given)
+    return PlannedMove(way_rad, times, envelope, gains, lent, find, foretold)
+
+
+def make_move(
+    drive: PositionDrive, planned: PlannedMove, settle_s: float, run: RunDirectory, say: Callable[[str], None]
+) -> tuple[MoveResult, MoveProfile | None, Trace]:
+    """Move within the limits, close the drive, and keep trace and stage in the run; raises as :func:`record_move`.
+
+    ``settle_s``: how long to look on after a demand ended. Returns the result, the counts that were found, the trace.
+    """
+    clock = drive.node.connection.clock
+    drive.error_limit_rad = planned.error_limit_rad
+    with guarded(drive, planned.envelope, say=say) as guard:
+        guard.write(planned.lent)
+        began = clock.now()
+        trace, counts = record_move(guard, drive, planned.way_rad, settle_s, planned.times, planned.find)
+        seconds = clock.now() - began
+    drive.close()
+    run.save(TRACE, trace_npz(trace))
+    found = move_result(trace)
+    values = [{"name": name, "value": float(getattr(found, name)), "unit": unit} for name, unit in UNITS.items()]
+    values += [{"name": name, "value": value, "unit": BY_NAME[name].unit} for name, value in planned.gains.items()]
+    summary = f"following error at most {shown(found.error_peak_rad, 'rad')}"
+    if planned.foretold:
+        values += planned.foretold.rows()
+        summary += f" (predicted: {planned.foretold})"
+    summary += f", settling: {shown(found.settling_s, 's')}"
+    doubts = trace.meta["doubts"]
+    run.add(Stage("move", "pass", seconds, values=values, files={TRACE: ""}, fallbacks=doubts, summary=summary))
+    return found, counts, trace
 
 
 def moved_machine(
