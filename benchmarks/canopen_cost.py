@@ -27,7 +27,7 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.bus.sdo import Mode, SdoChannel
 from pmsmtool.files import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.node.eds import FILE_NAME
+from pmsmtool.sim.node.objects import FILE_NAME
 
 ROUNDS = 2000
 REPEATS = 5

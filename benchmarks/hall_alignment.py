@@ -26,8 +26,8 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.errors import PmsmtoolError
 from pmsmtool.experiments.rotation import turn_over_halls
 from pmsmtool.identification.hall import HallAlignment, hall_alignment
-from pmsmtool.machine.hall import HALL_ORDERS
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
+from pmsmtool.machine.parameters import HALL_ORDERS
 from pmsmtool.sim.simulated_machine import settings_of
 
 ERROR_DEG, TURN_DEG = (5.0, 15.0), 25.0

@@ -41,7 +41,7 @@ from pmsmtool.bus.connect import connect
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.recorded_means import RecordingDrive
+from pmsmtool.drive.recorder_drives import RecordingDrive
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.torque_drives import TorqueDrive
 from pmsmtool.drive_maps.shipped_maps import load_family

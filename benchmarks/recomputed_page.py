@@ -28,7 +28,7 @@ from pmsmtool.design.design_file import Design
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import DesignInfeasible
-from pmsmtool.proof.recomputed_step import MOVED, SHIFT, SIGNALS, StepTask, step_task
+from pmsmtool.proof.simulated_margins import MOVED, SHIFT, SIGNALS, StepTask, step_task
 from pmsmtool.report.report import template
 from pmsmtool.sim.kernel import Part, Setup, Simulation, Target
 

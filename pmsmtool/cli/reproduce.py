@@ -128,7 +128,7 @@ def _series(found: Reproduction) -> list[Mapping[str, Any]]:
 
 
 def _text(row: Row, found: Reproduction) -> Iterator[str]:
-    from pmsmtool.papers.drawing import tables_of
+    from pmsmtool.papers.figure import tables_of
 
     yield f"{row.name}: {row.title}"
     yield found.source
@@ -144,7 +144,7 @@ def _text(row: Row, found: Reproduction) -> Iterator[str]:
 def _write(row: Row, found: Reproduction, path: Path | None, figure_path: Path | None, out: Output) -> None:
     from pmsmtool.cli.output import save_figure
     from pmsmtool.files import make_folder, write_file
-    from pmsmtool.papers.drawing import csv_text, figure_of
+    from pmsmtool.papers.figure import csv_text, figure_of
 
     targets: list[Path] = []
     if path is not None and path.suffix.lower() in _SUFFIXES and not path.is_dir():

@@ -170,7 +170,7 @@ def tune_command(
 
 
 def _plot(design: Design, path: Path) -> None:
-    from pmsmtool.design.loops.open_loops import open_loops
+    from pmsmtool.design.loops.designed_loops import open_loops
     from pmsmtool.report.figures import bode_figure
 
     loops = open_loops(design)

@@ -25,7 +25,7 @@ from pmsmtool.axis.drive import (
 from pmsmtool.axis.stored_gains import at_least_as_good
 from pmsmtool.design.closed_drive import RATED, STATED
 from pmsmtool.design.design_file import Design, DesignValue, Scalar, load_design
-from pmsmtool.design.loops.open_loops import (
+from pmsmtool.design.loops.designed_loops import (
     CURRENT_GAINS,
     CURRENT_LOOPS,
     SPEED_GAINS,

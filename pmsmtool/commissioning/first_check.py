@@ -28,8 +28,8 @@ from pmsmtool.identification.wiring import (
     judge_supply,
     judge_turn,
 )
-from pmsmtool.machine.hall import HallCommutation
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import HallCommutation
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import COMPENSATION, starting_gains
 from pmsmtool.units import rad_s_from_rpm

@@ -23,8 +23,8 @@ from pmsmtool.commissioning.design_stages import (
 from pmsmtool.commissioning.flash_stages import flash_stage, verify_stage
 from pmsmtool.design.design_file import load_design
 from pmsmtool.design.lookup.design import LookupRequest
+from pmsmtool.design.loops.designed_loops import CURRENT_LOOPS, lacking_gains
 from pmsmtool.design.loops.margins import MarginRequest
-from pmsmtool.design.loops.open_loops import CURRENT_LOOPS, lacking_gains
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive_maps.drive_map import DriveMap

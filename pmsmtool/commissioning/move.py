@@ -16,10 +16,10 @@ from pmsmtool.commissioning.axis_design import axis_drive
 from pmsmtool.commissioning.compared_stage import refuse_inertia
 from pmsmtool.commissioning.contradiction import flux_doubt
 from pmsmtool.design.design_file import Design
+from pmsmtool.drive.changed_objects import refuse_no_current
 from pmsmtool.drive.envelope import Envelope, largest_acceleration, largest_torque
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.motion_objects import first_of_axes, held_current_limits, low_limits
-from pmsmtool.drive.own_limits import refuse_no_current
 from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError

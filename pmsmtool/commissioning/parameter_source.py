@@ -9,7 +9,7 @@ from pathlib import Path
 from pmsmtool.commissioning.axis_design import axis_parameters
 from pmsmtool.design import design_file
 from pmsmtool.design.design_file import parse_design
-from pmsmtool.design.loops.open_loops import SMALLER, smaller_gains
+from pmsmtool.design.loops.designed_loops import SMALLER, smaller_gains
 from pmsmtool.drive_maps.dcf import values_of
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.eds import parse_eds

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """What the page of a report computes again while its reader moves R, L, the delay or a limit.
 
-The step is computed in the page by the code that predicts it here (``proof/recomputed_step.py``). Loop margins are
+The step is computed in the page by the code that predicts it here (``proof/simulated_margins.py``). Loop margins are
 interpolated in a map that is made here, by the function that the stage ``margins`` is judged with.
 """
 
@@ -21,7 +21,7 @@ from pmsmtool.design.loops.margins import MarginProblem, margin_problem
 from pmsmtool.design.loops.vector_margins import VectorMargins, current_response, vector_margins
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.native import page_module
-from pmsmtool.proof.recomputed_step import DRAWN, MOVED, PARTS, SHIFT, SIGNALS, StepTask, step_task
+from pmsmtool.proof.simulated_margins import DRAWN, MOVED, PARTS, SHIFT, SIGNALS, StepTask, step_task
 
 NO_MODULE = (
     "This page does not compute the step again: the installation has no WebAssembly module. In a checkout: pip install "

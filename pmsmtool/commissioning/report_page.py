@@ -21,8 +21,8 @@ from pmsmtool.axis.move import compared_moves, move_result, same_move, shown
 from pmsmtool.commissioning.recomputed_page import loop_margins, recomputed
 from pmsmtool.design.design_file import Design, load_design
 from pmsmtool.design.loops.current_loop import HOLD_PERIODS
+from pmsmtool.design.loops.designed_loops import open_loops
 from pmsmtool.design.loops.margins import margin_problem
-from pmsmtool.design.loops.open_loops import open_loops
 from pmsmtool.design.minimum_time import TransferProblem, minimum_time
 from pmsmtool.design.prediction import Prediction
 from pmsmtool.errors import DesignInfeasible, IdentificationError

@@ -24,7 +24,7 @@ import numpy as np
 from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.lookup.table import torque_limits
-from pmsmtool.design.loops.open_loops import (
+from pmsmtool.design.loops.designed_loops import (
     CURRENT_GAINS,
     CURRENT_LOOPS,
     SPEED_LOOP,

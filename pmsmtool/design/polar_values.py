@@ -28,8 +28,8 @@ from pmsmtool.design.polar import (
     largest_i_q,
     linearised,
 )
-from pmsmtool.design.polar_laws import LAWS, LINEAR_RANGE, ON_MEASUREMENT, PHASE_LAWS, PREDICT, SURFACE_ONLY
 from pmsmtool.design.ratings import Ratings
+from pmsmtool.design.tune_request import LINEAR_RANGE, ON_MEASUREMENT, PHASE_LAWS, POLAR_LAWS, PREDICT, SURFACE_ONLY
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.torque import torque_per_ampere
@@ -97,7 +97,7 @@ def polar_values(
     source, rated : MachineFile, Ratings
         Machine and its limits.
     law : str
-        A key of :data:`polar_laws.LAWS`.
+        A key of :data:`tune_request.POLAR_LAWS`.
     weakening : str
         Mode of field weakening that was designed; other than ``lookup`` it is switched off.
     """
@@ -105,7 +105,7 @@ def polar_values(
     surface = SurfaceMachine.of(source.machine) if law in SURFACE_ONLY else _surface(source)
     options, how = _options(source.inverter.delay_periods, law)
     values = {
-        "polar.mode": DesignValue(LAWS[law], f"{law}, as asked for"),
+        "polar.mode": DesignValue(POLAR_LAWS[law], f"{law}, as asked for"),
         "polar.options": DesignValue(options, how),
         "polar.sigma_phase_rad_s": DesignValue(PHASE_SIGMA_RAD_S, "real part of the placed poles"),
         "polar.sigma_amplitude_rad_s": DesignValue(AMPLITUDE_SIGMA_RAD_S, "real part of the placed poles"),

@@ -14,8 +14,8 @@ from pathlib import Path
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.field_weakening import design_field_weakening
 from pmsmtool.design.governor import design_governor
-from pmsmtool.design.loops.bandwidth import CurrentChoice, choose_current
 from pmsmtool.design.loops.current_loop import maximum_delay_periods
+from pmsmtool.design.loops.designed_loops import CurrentChoice, choose_current
 from pmsmtool.design.loops.sampled_loop import LoopMargins, margins
 from pmsmtool.design.loops.speed_loop import (
     Notch,

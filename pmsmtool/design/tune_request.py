@@ -11,11 +11,29 @@ from typing import Any, get_args
 from pmsmtool.design.design_file import Scalar
 from pmsmtool.design.loops.current_loop import Method
 from pmsmtool.design.loops.speed_loop import SpeedMethod
-from pmsmtool.design.polar_laws import LAWS as POLAR_LAWS
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.key import Key, KeyKind, check_table, not_numbers
 from pmsmtool.machine.uncontrolled_generation import Protection
 from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES, GOVERNOR_MODES
+
+POLAR_LAWS: Mapping[str, int] = {
+    "conventional": 1,
+    "proposed": 2,
+    "linear": 3,
+    "linear-printed": 4,
+    "regularised": 5,
+    "unified": 6,
+}
+"""``polar.mode`` of the catalogue."""
+
+SURFACE_ONLY = ("conventional", "proposed", "linear", "linear-printed")
+"""Laws of the paper: they hold for L_d = L_q."""
+
+ON_MEASUREMENT, NO_ANTI_WINDUP, PREDICT, LINEAR_RANGE = 1, 2, 4, 8
+"""Bits of ``polar.options``: P and D on the measurement, (ablation), prediction, switch to the regularised law."""
+
+PHASE_LAWS = ("conventional", "proposed")
+"""Laws of section III: the phase is the input for i_q, which needs speed."""
 
 CONTROLLERS = ("pi", "polar")
 
@@ -29,7 +47,7 @@ class TuneRequest:
     controller : str
         ``pi`` (field-oriented) or ``polar`` (voltage amplitude and phase as inputs).
     polar_law : str
-        Law of ``polar`` (``polar_laws.LAWS``).
+        Law of ``polar`` (:data:`POLAR_LAWS`).
     method : str
         Rule of the current gains: ``imc``, ``modulus-optimum`` or ``second-order``.
     bandwidth_hz : float or None

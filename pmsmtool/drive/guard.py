@@ -16,14 +16,13 @@ from dataclasses import replace
 from pmsmtool.cia402 import QuickStop
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.changed_objects import ChangedObjects
+from pmsmtool.drive.changed_objects import NO_LIMITS, ChangedObjects, clear_offsets, lower_limits, put_limit
 from pmsmtool.drive.dead_man import DeadManProof, prove_dead_man, set_quick_stop
 from pmsmtool.drive.drive_node import is_safe, state_text
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
 from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.motion_objects import OVER_SPEED_TRIP, lowered_trip, trips_itself
-from pmsmtool.drive.own_limits import NO_LIMITS, clear_offsets, lower_limits, put_limit
 from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, ProfileMove, Recording, Shape
 from pmsmtool.errors import (
     BusError,

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
-from pmsmtool.machine.hall import HALL_ORDERS, HALL_SECTOR_RAD, PHASES, hall_axis
+from pmsmtool.machine.parameters import HALL_ORDERS, HALL_SECTOR_RAD, PHASES, hall_axis
 from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 

@@ -7,8 +7,10 @@ motoring positive; resistance and inductance per phase (star).
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Literal
 
 import numpy as np
@@ -16,6 +18,31 @@ import numpy as np
 from pmsmtool.machine.temperature import COPPER_ALPHA_PER_K, MAGNET_ALPHA_PER_K
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
 from pmsmtool.units import RAD_S_PER_RPM, format_quantity
+
+PHASES = "abc"
+"""Of three Hall sensors a third of an electrical turn apart, too."""
+HALL_ORDERS = tuple("".join(order) for order in itertools.permutations(PHASES))
+"""Phase whose sensor is on wires 1, 2 and 3."""
+HALL_SECTOR_RAD = math.pi / 3.0
+"""Angle over which no wire changes, electrical."""
+
+
+class HallCommutation(IntEnum):
+    """Values of ``hall.commutation``, the enum ``pmsm_hall_commutation`` of the exported C."""
+
+    NONE = 0
+    START = 1
+    """Until the encoder counts from its index."""
+    ALONE = 2
+    """In place of an encoder."""
+    STEPS = 3
+    """The same, in a frame that stands in the middle of the sector: six steps per turn."""
+
+
+def hall_axis(phase: str) -> float:
+    """Return the electrical angle (rad) at the middle of the half turn in which the sensor of a phase is high."""
+    return 2.0 * HALL_SECTOR_RAD * PHASES.index(phase)
+
 
 Shaft = Literal["free", "locked", "coupled"]
 Load = Literal["none", "gravity"]

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import math
 
-from pmsmtool.machine.hall import HALL_ORDERS
 from pmsmtool.machine.key import Key, Value
-from pmsmtool.machine.parameters import MAX_POLE_PAIRS, MachineParameters
+from pmsmtool.machine.parameters import HALL_ORDERS, MAX_POLE_PAIRS, MachineParameters
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.units import format_quantity
 

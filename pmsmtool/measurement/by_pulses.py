@@ -17,10 +17,10 @@ from dataclasses import replace
 
 from pmsmtool.cia402 import HOMING_LOST, LEAST_LINK_V
 from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive.changed_objects import refuse_no_current
 from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive, guarded
 from pmsmtool.drive.motion_objects import allowed, held_current_limits, rated_apk, speed_limits, trips_itself
-from pmsmtool.drive.own_limits import refuse_no_current
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
 from pmsmtool.drive.torque_drives import SpeedPushDrive, TorqueDrive, pushing_drive
 from pmsmtool.drive_maps.drive_map import DriveMap

@@ -17,7 +17,6 @@ from typing import TypeVar
 from pmsmtool.cia402 import Mode
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.heartbeat import expects_pdos
-from pmsmtool.drive.mapped_recorder_drive import records_pushes
 from pmsmtool.drive.motion_objects import (
     LEAST_TURNS,
     NO_RATED,
@@ -33,6 +32,7 @@ from pmsmtool.drive.motion_objects import (
 )
 from pmsmtool.drive.objects import CONSUMER_HEARTBEAT, GUARD_TIME_MS, LIFE_TIME_FACTOR, SUPPORTED_MODES, DriveObject
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive.recorder_drives import records_pushes
 from pmsmtool.drive.recorders.choice import described
 from pmsmtool.drive.set_point import FOLLOWING_ERROR, POSITION_DEMAND, TARGET_POSITION
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
@@ -43,7 +43,7 @@ from pmsmtool.errors import NotAvailable, SdoAbort
 from pmsmtool.flash.map_gate import map_on
 from pmsmtool.identification.request import Method
 from pmsmtool.identification.value_verdict import NOT_TOLD
-from pmsmtool.machine.hall import HallCommutation
+from pmsmtool.machine.parameters import HallCommutation
 from pmsmtool.params.catalogue import BY_NAME
 from pmsmtool.plain_text import by_reason
 

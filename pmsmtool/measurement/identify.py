@@ -17,8 +17,7 @@ from typing import Any
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
-from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
-from pmsmtool.drive.recorded_means import RecordingDrive
+from pmsmtool.drive.recorder_drives import MappedRecorderDrive, RecordingDrive
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.torque_drives import ParameterDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive

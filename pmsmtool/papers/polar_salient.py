@@ -9,7 +9,7 @@ from functools import cache
 
 import numpy as np
 
-from pmsmtool.design.polar_laws import LAWS
+from pmsmtool.design.tune_request import POLAR_LAWS
 from pmsmtool.errors import DesignInfeasible
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
@@ -114,7 +114,7 @@ def point(r: Response, name: str = INTERIOR) -> Point:
 def refusals() -> dict[str, str]:
     """Return each law's name and why it is refused on the interior machine; empty where it is not."""
     found: dict[str, str] = {}
-    for law in LAWS:
+    for law in POLAR_LAWS:
         try:
             parameter_set(Controller(law, law), interior())
         except DesignInfeasible as error:

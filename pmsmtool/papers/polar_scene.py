@@ -15,9 +15,8 @@ from functools import cache
 import numpy as np
 
 from pmsmtool.arrays import Array
-from pmsmtool.design.polar_laws import LAWS, LINEAR_RANGE, NO_ANTI_WINDUP, ON_MEASUREMENT, PREDICT
 from pmsmtool.design.tune import tune
-from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.design.tune_request import LINEAR_RANGE, NO_ANTI_WINDUP, ON_MEASUREMENT, POLAR_LAWS, PREDICT, TuneRequest
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.params.parameter_set import ParameterSet
@@ -180,7 +179,7 @@ def parameter_set(controller: Controller, source: MachineFile) -> ParameterSet:
     tuned = design.parameter_set()
     values = dict(tuned.values)
     if controller.law and controller.options >= 0:
-        predict = PREDICT if source.inverter.delay_periods >= 1.0 and LAWS[controller.law] >= 5 else 0
+        predict = PREDICT if source.inverter.delay_periods >= 1.0 and POLAR_LAWS[controller.law] >= 5 else 0
         values["polar.options"] = float(controller.options | predict)
     if controller.cdm:
         values |= _cdm_gains(source)

@@ -70,7 +70,7 @@ FIGURES: tuple[Row, ...] = (
     Row("polar-steps", "polar_steps:compared", "torque steps at 800 rpm by every law and FOC", MIYAJIMA, 1.0),
     Row("polar-linear", "polar_linear:compared", "linear range by every law and FOC", MIYAJIMA, 1.0),
     Row("polar-noise", "polar_linear:at_zero_voltage", "phase oscillation around zero voltage", MIYAJIMA, 2.0),
-    Row("polar-ramps", "polar_ramps:transitions", "transitions on torque and speed ramps", MIYAJIMA, 1.5),
+    Row("polar-ramps", "polar_sweep:transitions", "transitions on torque and speed ramps", MIYAJIMA, 1.5),
     Row("polar-limit", "polar_limit:modulation_limit", "overmodulation, six-step, torque out of reach", MIYAJIMA, 1.5),
     Row("polar-equilibria", "polar_plane:equilibria", "equilibrium search and linear model", MIYAJIMA, 0.5),
     Row("polar-map", "polar_plane:controllability", "condition number, controllability, true poles", MIYAJIMA, 0.5),

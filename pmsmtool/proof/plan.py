@@ -14,7 +14,7 @@ from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Shape
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.identification.frequency_response import NOTHING, RIGID, SHOWN
 from pmsmtool.identification.mechanics import ELASTIC_FALLBACK, MEAN_FALLBACK, PLAY_FALLBACK
-from pmsmtool.machine.hall import HallCommutation
+from pmsmtool.machine.parameters import HallCommutation
 from pmsmtool.machine.torque import torque_per_ampere
 from pmsmtool.machine.two_masses import (
     CERTAIN_ZETA,

@@ -31,9 +31,8 @@ from can.broadcastmanager import (
 from pmsmtool.bus.clock import NEVER, NS, Ticker, VirtualClock
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import profile_names
-from pmsmtool.sim.bench_supply import BenchSupply
 from pmsmtool.sim.channel import build_line, parse_channel
-from pmsmtool.sim.drive_kernel import KernelCore
+from pmsmtool.sim.drive_kernel import BenchSupply, KernelCore
 from pmsmtool.sim.line import EXTENDED, REMOTE, Frame, Line
 
 POLL_NS = 10_000

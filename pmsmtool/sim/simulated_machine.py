@@ -15,9 +15,9 @@ from dataclasses import replace
 from typing import Any
 
 from pmsmtool.errors import ConfigError, next_step
-from pmsmtool.machine.hall import hall_axis
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile
+from pmsmtool.machine.parameters import hall_axis
 from pmsmtool.machine.two_masses import damping_nms_per_rad
 from pmsmtool.sim.kernel import Application, Rotor, Setup, library
 from pmsmtool.units import RAD_S_PER_RPM

@@ -24,7 +24,7 @@ from pmsmtool.commissioning.design_stages import lut_stage, tune_stage
 from pmsmtool.commissioning.printed_page import LIMIT_S, QUIET, find_browser, print_page
 from pmsmtool.design.design_file import load_design
 from pmsmtool.design.lookup.design import LookupRequest
-from pmsmtool.design.loops.open_loops import open_loops
+from pmsmtool.design.loops.designed_loops import open_loops
 from pmsmtool.design.loops.sampled_loop import margins
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, IdentificationError

@@ -25,7 +25,7 @@ from pmsmtool.commissioning.level_stages import NO_STEPS, LevelStages
 from pmsmtool.commissioning.report_page import NO_DATA_SHEET, report_page, verdict
 from pmsmtool.design.closed_drive import RATED, SLOPE, SPEED, TORQUE
 from pmsmtool.design.design_file import load_design
-from pmsmtool.design.loops.open_loops import lacking_gains
+from pmsmtool.design.loops.designed_loops import lacking_gains
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters

@@ -16,8 +16,8 @@ from pmsmtool.cli.main import cli
 from pmsmtool.commissioning.axis_design import held_design, why_not_judged
 from pmsmtool.design.closed_drive import RATED, SLOPE, STATED, TORQUE
 from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design, parse_design
+from pmsmtool.design.loops.designed_loops import CURRENT_GAINS, open_loops
 from pmsmtool.design.loops.margins import margin_report
-from pmsmtool.design.loops.open_loops import CURRENT_GAINS, open_loops
 from pmsmtool.design.loops.sampled_loop import margins
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune

@@ -22,10 +22,9 @@ from pmsmtool.design.lookup import grid, table
 from pmsmtool.design.lookup.design import LookupRequest, _fitting
 from pmsmtool.design.lookup.grid import GridBounds, table_words
 from pmsmtool.design.lookup.table import LookupTable, speed_table
-from pmsmtool.design.loops.bandwidth import choose_current
 from pmsmtool.design.loops.current_loop import second_order
+from pmsmtool.design.loops.designed_loops import CURRENT_GAINS, choose_current, smaller_gains
 from pmsmtool.design.loops.margins import margin_problem
-from pmsmtool.design.loops.open_loops import CURRENT_GAINS, smaller_gains
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import pole_placement, symmetric_optimum
 from pmsmtool.design.operating_machine import OperatingMachine

@@ -9,9 +9,8 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.design.polar_laws import LINEAR_RANGE
 from pmsmtool.design.tune import tune
-from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.design.tune_request import LINEAR_RANGE, TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible
 from pmsmtool.machine.machine_file import load_machine_file
 

@@ -13,7 +13,7 @@ import pytest
 from pmsmtool.axis.loops import AxisGains, AxisPath, lifted, open_loop
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
-from pmsmtool.design.loops.open_loops import open_loops
+from pmsmtool.design.loops.designed_loops import open_loops
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.speed_loop import (
     ELASTIC_MODULUS,

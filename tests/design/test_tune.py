@@ -17,8 +17,8 @@ from benchmarks.random_drives import draw_drive
 from pmsmtool.cli.main import cli
 from pmsmtool.design.design_file import Design, design_text, load_design, parse_design
 from pmsmtool.design.lookup.table import torque_limits
-from pmsmtool.design.loops.bandwidth import choose_current, least_inductance
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc
+from pmsmtool.design.loops.designed_loops import choose_current, least_inductance
 from pmsmtool.design.loops.sampled_loop import margins
 from pmsmtool.design.operating_machine import at_temperature
 from pmsmtool.design.ratings import base_speed_rpm, ratings
@@ -338,13 +338,13 @@ def test_command_exit_codes(tmp_path: Path) -> None:
 
 def test_choices_of_the_command_are_those_of_the_design() -> None:
     from pmsmtool.cli.tune import tune_command
-    from pmsmtool.design import polar_laws
+    from pmsmtool.design.tune_request import POLAR_LAWS
     from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES, GOVERNOR_MODES
 
     choices = {p.name: tuple(p.type.choices) for p in tune_command.params if hasattr(p.type, "choices")}
     assert choices["governor"] == tuple(GOVERNOR_MODES)
     assert choices["field_weakening"] == ("auto", *FIELD_WEAKENING_MODES)
-    assert choices["polar_law"] == tuple(polar_laws.LAWS)
+    assert choices["polar_law"] == tuple(POLAR_LAWS)
     for name, options in choices.items():
         for option in options:
             assert TuneRequest(**{name: option}).table()[name] == option

@@ -13,11 +13,11 @@ import pytest
 from pmsmtool.cia402 import LEAST_LINK_V
 from pmsmtool.drive import motion_objects as motion
 from pmsmtool.drive import objects
-from pmsmtool.drive.mapped_recorder_drive import LINEAR_SHARE, MappedRecorderDrive
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Recording
 from pmsmtool.drive.position_drive import PositionDrive
+from pmsmtool.drive.recorder_drives import LINEAR_SHARE, MappedRecorderDrive
 from pmsmtool.drive_maps.drive_map import LETTERS
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import NotAvailable

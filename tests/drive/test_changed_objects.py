@@ -15,12 +15,19 @@ import pytest
 from pmsmtool.bus.nmt import NmtState
 from pmsmtool.drive import heartbeat as beating
 from pmsmtool.drive import objects
-from pmsmtool.drive.changed_objects import OFTEN, ChangedObjects, any_lent, restore_lent
+from pmsmtool.drive.changed_objects import (
+    LEAST_COUNTS,
+    OFTEN,
+    ChangedObjects,
+    any_lent,
+    lower_limits,
+    put_limit,
+    restore_lent,
+)
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.motion_objects import MAX_TORQUE_PERMILLE, Quantity
 from pmsmtool.drive.objects import DriveObject
-from pmsmtool.drive.own_limits import LEAST_COUNTS, lower_limits, put_limit
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map import reference_map

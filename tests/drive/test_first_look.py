@@ -12,11 +12,11 @@ import pytest
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.drive import objects
+from pmsmtool.drive.changed_objects import OFFSETS, clear_offsets, lower_limits
 from pmsmtool.drive.drive_node import LOOKS, DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.objects import DriveObject
-from pmsmtool.drive.own_limits import OFFSETS, clear_offsets, lower_limits
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveTimeout, SafetyRefusal, SdoAbort
 from tests.drive.bench import ENVELOPE, SimBench, sim_bench

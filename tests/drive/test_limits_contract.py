@@ -26,10 +26,9 @@ from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
 from pmsmtool.drive.envelope import OFF_S, Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import FRESH_S, LOCKED_TRAVEL_RAD, OVERSHOOT, WATCH_S, GuardedDrive, guarded
 from pmsmtool.drive.heartbeat import PERIOD_S
-from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
 from pmsmtool.drive.port import Drive
 from pmsmtool.drive.position_drive import PositionDrive
-from pmsmtool.drive.recorded_means import RecordedMeans
+from pmsmtool.drive.recorder_drives import MappedRecorderDrive, RecordedMeans
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.torque_drives import SpeedPushDrive, TorqueDrive

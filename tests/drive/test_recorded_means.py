@@ -14,7 +14,7 @@ from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.recorded_means import AT_REST, LOOK, TURNING, RecordedMeans, RecordingDrive, spacing
+from pmsmtool.drive.recorder_drives import AT_REST, LOOK, TURNING, RecordedMeans, RecordingDrive, spacing
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
 

@@ -11,8 +11,8 @@ import pytest
 
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.mapped_recorder_drive import MappedRecorderDrive
 from pmsmtool.drive.port import Recording
+from pmsmtool.drive.recorder_drives import MappedRecorderDrive
 from pmsmtool.drive.recorders.commanded import numbered
 from pmsmtool.drive_maps import epos2_objects as rings
 from pmsmtool.drive_maps import ingenia_objects as monitor

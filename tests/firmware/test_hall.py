@@ -17,9 +17,9 @@ import pmsmtool
 from pmsmtool.design.tune import tune
 from pmsmtool.firmware.image import pack_image
 from pmsmtool.identification.hall import HallAlignment
-from pmsmtool.machine.hall import HALL_ORDERS, HallCommutation
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.machine.parameters import HALL_ORDERS, HallCommutation
 from pmsmtool.sim.closed_loop import drive_values
 from pmsmtool.sim.kernel import Part, Signal, Simulation, Truth
 from pmsmtool.sim.node.drive_core import ControlMode, HomingPhase

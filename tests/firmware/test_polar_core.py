@@ -17,7 +17,6 @@ from pmsmtool.firmware.core_binding import core
 from pmsmtool.papers import (
     polar_limit,
     polar_linear,
-    polar_ramps,
     polar_salient,
     polar_steps,
     polar_sweep,
@@ -157,10 +156,10 @@ def test_the_mirror_is_exact_but_for_rounding() -> None:
     assert np.abs(found[0] - found[1]).max() <= MIRROR_DOUBLE_A
 
 
-@pytest.mark.parametrize("ramp", [polar_ramps.TORQUE, polar_ramps.SPEED], ids=["torque", "speed"])
-def test_torque_bump_on_ramps(ramp: polar_ramps.Ramp) -> None:
+@pytest.mark.parametrize("ramp", [polar_sweep.TORQUE, polar_sweep.SPEED], ids=["torque", "speed"])
+def test_torque_bump_on_ramps(ramp: polar_sweep.Ramp) -> None:
     bump = {
-        law.name: polar_ramps.measured(polar_ramps.response(law, ramp), ramp)[0]
+        law.name: polar_sweep.measured(polar_sweep.response(law, ramp), ramp)[0]
         for law in (PROPOSED, UNIFIED, UNIFIED_TUNED)
     }
     assert bump[UNIFIED.name] <= RAMP_BUMP
@@ -169,8 +168,8 @@ def test_torque_bump_on_ramps(ramp: polar_ramps.Ramp) -> None:
 
 
 def test_reversal_through_zero_voltage() -> None:
-    r = polar_ramps.response(UNIFIED_TUNED, polar_ramps.REVERSAL)
-    bump, error, i_d = polar_ramps.measured(r, polar_ramps.REVERSAL)
+    r = polar_sweep.response(UNIFIED_TUNED, polar_sweep.REVERSAL)
+    bump, error, i_d = polar_sweep.measured(r, polar_sweep.REVERSAL)
     assert bump <= RAMP_BUMP  # 0.0172
     assert error <= 2 * RAMP_BUMP  # 0.0233
     assert i_d <= UNIFIED_PEAK  # 0.037
@@ -223,7 +222,7 @@ def test_phase_is_quiet_at_zero_voltage(law: Controller) -> None:
     assert max(improved.spikes_a) <= SPIKE < max(papers.spikes_a)  # the paper's 1.2
 
 
-@pytest.mark.parametrize("law", [SWITCHED, polar_ramps.CONVENTIONAL_SWITCHED], ids=lambda law: law.name)
+@pytest.mark.parametrize("law", [SWITCHED, polar_sweep.CONVENTIONAL_SWITCHED], ids=lambda law: law.name)
 def test_switching_to_the_linear_law_is_bumpless(law: Controller) -> None:
     step = measured(law)
     assert step.up_ms <= 11.0  # 7.9 and 9.8
@@ -233,7 +232,7 @@ def test_switching_to_the_linear_law_is_bumpless(law: Controller) -> None:
     assert abs(step.end_a) <= PROPOSED_I_D
 
 
-@pytest.mark.parametrize("law", [SWITCHED, polar_ramps.CONVENTIONAL_SWITCHED], ids=lambda law: law.name)
+@pytest.mark.parametrize("law", [SWITCHED, polar_sweep.CONVENTIONAL_SWITCHED], ids=lambda law: law.name)
 def test_the_switch_makes_the_phase_laws_work_at_standstill(law: Controller) -> None:
     r = run(law, SIMULATION, steps([(0.0, 0.0), (0.01, 1.0)]), [(0.0, 0.0)], 0.06)
     assert r.torque[-1] == pytest.approx(1.0, abs=1e-3)

@@ -10,7 +10,7 @@ import pytest
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.identification.hall import hall_alignment
-from pmsmtool.machine.hall import HALL_ORDERS, hall_axis
+from pmsmtool.machine.parameters import HALL_ORDERS, hall_axis
 from pmsmtool.trace import Trace
 
 ERRORS = {"a": 0.2, "b": -0.15, "c": 0.1}

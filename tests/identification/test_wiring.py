@@ -22,7 +22,7 @@ from pmsmtool.identification.wiring import (
     supply_power,
     supply_under_load,
 )
-from pmsmtool.machine.hall import HALL_ORDERS, hall_axis
+from pmsmtool.machine.parameters import HALL_ORDERS, hall_axis
 from pmsmtool.trace import Trace
 
 

@@ -19,8 +19,8 @@ from pmsmtool.cli.main import cli
 from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import guarded
-from pmsmtool.drive.mapped_recorder_drive import DELAY_DOUBT_PERIODS, RECORDED, MappedRecorderDrive
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
+from pmsmtool.drive.recorder_drives import DELAY_DOUBT_PERIODS, RECORDED, MappedRecorderDrive
 from pmsmtool.drive.standard_drive import StandardDrive
 from pmsmtool.drive.torque_drives import ParameterDrive
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, parse_drive_map

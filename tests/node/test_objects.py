@@ -17,15 +17,14 @@ from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.files import data_folder
 from pmsmtool.params.catalogue import CATALOGUE, layout_signature
 from pmsmtool.sim.node.dictionary import Dictionary
-from pmsmtool.sim.node.eds import FILE_NAME, MAP_NAME, eds_text
-from pmsmtool.sim.node.objects import ObjectRow, build_rows, object_rows
+from pmsmtool.sim.node.objects import FILE_NAME, MAP_NAME, ObjectRow, build_rows, eds_text, object_rows
 from tests.node.bench import Bench
 
 FOLDER = data_folder("firmware-params") / "pmsmsim"
 
 
 def test_the_committed_data_sheet_and_map_are_the_generated_ones() -> None:
-    """Regenerate with ``python -m pmsmtool.sim.node.eds``."""
+    """Regenerate with ``python -m pmsmtool.sim.node.objects``."""
     assert (FOLDER / FILE_NAME).read_text(encoding="ascii") == eds_text()
     assert parse_drive_map((FOLDER / MAP_NAME).read_text(encoding="ascii")) == reference_map()
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from pmsmtool.errors import ConfigError
-from pmsmtool.papers.drawing import csv_text, figure_of, tables_of
 from pmsmtool.papers.figure import (
     Check,
     Column,
@@ -22,7 +21,10 @@ from pmsmtool.papers.figure import (
     at_least,
     at_most,
     check_table,
+    csv_text,
+    figure_of,
     near,
+    tables_of,
 )
 from pmsmtool.papers.registry import FIGURES, find
 

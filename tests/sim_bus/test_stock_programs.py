@@ -14,7 +14,7 @@ import pytest
 
 from pmsmtool.files import data_folder
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.node.eds import eds_text
+from pmsmtool.sim.node.objects import eds_text
 from tests.node.bench import SERIAL, Bench
 from tests.node.conftest import BenchMaker
 

@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.headroom import Headroom, HeadroomLimits, OperatingCells, headroom, operating_cells
-from pmsmtool.design.loops.bandwidth import least_inductance
 from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, axis_loop
-from pmsmtool.design.loops.open_loops import designed_speed_loop
+from pmsmtool.design.loops.designed_loops import designed_speed_loop, least_inductance
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
 from pmsmtool.design.loops.vector_margins import (
     Response,

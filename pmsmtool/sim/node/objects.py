@@ -7,6 +7,9 @@ becomes an object too. Both the running node and its EDS are built from :func:`o
 Columns: ``index`` and ``sub`` hexadecimal; ``key``, by which the program names the object; ``type`` (``ARRAY`` and
 ``RECORD`` head a group, with 8 they have a writable sub 0); ``access``; ``pdo`` T mappable for sending, R for receiving
 too, 0 neither; ``default``, ``low``, ``high``; ``store`` y: kept by 0x1010.
+
+``python -m pmsmtool.sim.node.objects`` rewrites ``firmware-params/pmsmsim/pmsmsim.eds`` (CiA 306-1) and, beside it,
+``map.toml``, the drive's map as any other drive would need one; neither carries a date.
 """
 
 from __future__ import annotations
@@ -14,11 +17,15 @@ from __future__ import annotations
 import csv
 import math
 import struct
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from pmsmtool.data_types import BY_SHORT, SHORT, DataType
+from pmsmtool.drive_maps.drive_map import reference_map
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map
 from pmsmtool.files import data_folder
 from pmsmtool.params.catalogue import CATALOGUE, SCHEMA_VERSION, Parameter, layout_signature
 
@@ -165,3 +172,99 @@ def _with_default(row: ObjectRow, highest: int) -> ObjectRow:
         row.index, row.sub, row.key, row.name, row.type, row.access, row.pdo, row.unit,
         str(highest), row.low, row.high, row.stored, row.container,
     )  # fmt: skip
+
+
+FILE_NAME = "pmsmsim.eds"
+MAP_NAME = "map.toml"
+_VAR, _DOMAIN, _ARRAY, _RECORD = 0x7, 0x2, 0x8, 0x9
+_MANDATORY = (0x1000, 0x1001, 0x1018)
+_BAUD_RATES = (10, 20, 50, 125, 250, 500, 800, 1000)
+
+
+def eds_text() -> str:
+    """Return the data sheet of the simulated drive."""
+    rows = object_rows()
+    return "\n".join([*_file_info(), *_device_info(rows), *_object_lists(rows), *_objects(rows)]) + "\n"
+
+
+def _file_info() -> Iterator[str]:
+    yield from ("[FileInfo]", f"FileName={FILE_NAME}", "FileVersion=1", "FileRevision=0", "EDSVersion=4.0")
+    yield from ("Description=Simulated PMSM drive of pmsmtool", "CreatedBy=pmsmtool", "ModifiedBy=pmsmtool", "")
+
+
+def _device_info(rows: Sequence[ObjectRow]) -> Iterator[str]:
+    by_key = {row.key: row.default for row in rows}
+    yield from ("[DeviceInfo]", "VendorName=pmsmtool", f"VendorNumber={by_key['identity.vendor']}")
+    yield from (f"ProductName={by_key['device.name']}", f"ProductNumber={by_key['identity.product']}")
+    yield f"RevisionNumber={by_key['identity.revision']}"
+    for rate in _BAUD_RATES:
+        yield f"BaudRate_{rate}=1"
+    yield from ("SimpleBootUpMaster=0", "SimpleBootUpSlave=1", "Granularity=8", "DynamicChannelsSupported=0")
+    yield from ("GroupMessaging=0", "NrOfRXPDO=4", "NrOfTXPDO=4", "LSS_Supported=1", "")
+    yield "[DummyUsage]"
+    for code in range(1, 8):
+        yield f"Dummy{code:04X}=0"
+    yield from ("", "[Comments]", "Lines=0", "")
+
+
+def _object_lists(rows: Sequence[ObjectRow]) -> Iterator[str]:
+    indices = sorted({row.index for row in rows})
+    groups = {
+        "MandatoryObjects": [index for index in indices if index in _MANDATORY],
+        "OptionalObjects": [index for index in indices if index not in _MANDATORY and not 0x2000 <= index < 0x6000],
+        "ManufacturerObjects": [index for index in indices if 0x2000 <= index < 0x6000],
+    }
+    for name, members in groups.items():
+        yield from (f"[{name}]", f"SupportedObjects={len(members)}")
+        for number, index in enumerate(members, 1):
+            yield f"{number}=0x{index:04X}"
+        yield ""
+
+
+def _objects(rows: Sequence[ObjectRow]) -> Iterator[str]:
+    for row in rows:
+        if row.container:
+            members = sum(other.index == row.index for other in rows)
+            kind = _ARRAY if row.container == "ARRAY" else _RECORD
+            yield from (f"[{row.index:04X}]", f"ParameterName={row.name}", f"ObjectType=0x{kind:X}")
+            yield from (f"SubNumber={members}", "")
+            yield from _variable(f"{row.index:04X}sub0", row, "Highest sub-index supported")
+        else:
+            alone = row.sub == 0
+            yield from _variable(f"{row.index:04X}" if alone else f"{row.index:04X}sub{row.sub:X}", row, row.name)
+
+
+def _variable(section: str, row: ObjectRow, name: str) -> Iterator[str]:
+    kind = _DOMAIN if row.type == "DOMAIN" else _VAR
+    access = "rww" if row.pdo == "R" else row.access
+    yield from (f"[{section}]", f"ParameterName={name}", f"ObjectType=0x{kind:X}")
+    yield from (f"DataType=0x{row.data_type.code:04X}", f"AccessType={access}")
+    if row.type != "DOMAIN":
+        yield f"DefaultValue={row.default}"
+    if not row.container:
+        yield from _limits(row)
+    yield from (f"PDOMapping={int(row.pdo in ('T', 'R'))}", "")
+
+
+def _limits(row: ObjectRow) -> Iterator[str]:
+    for label, bound in (("LowLimit", row.low), ("HighLimit", row.high)):
+        if bound is not None:
+            yield f"{label}={bound:.9g}" if row.data_type.is_float else f"{label}={_integer(row, int(bound))}"
+
+
+def _integer(row: ObjectRow, bound: int) -> str:
+    """Return an integer limit; negative ones as two's complement, which every reader understands."""
+    return f"{bound}" if bound >= 0 else f"0x{bound & (1 << 8 * row.data_type.size) - 1:X}"
+
+
+def write_files() -> tuple[str, str]:
+    """Write data sheet and map beside the object table and return their paths."""
+    folder = data_folder("firmware-params") / "pmsmsim"
+    texts = {FILE_NAME: eds_text(), MAP_NAME: dump_drive_map(reference_map())}
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="ascii", newline="\n")
+    return str(folder / FILE_NAME), str(folder / MAP_NAME)
+
+
+if __name__ == "__main__":
+    sys.stdout.write("\n".join(write_files()) + "\n")

@@ -17,7 +17,7 @@ from pmsmtool.cia402 import AbortConnection, Control, FaultReaction, Mode, Quick
 from pmsmtool.sim.kernel import Signal
 from pmsmtool.sim.node.dictionary import Dictionary, Refused
 from pmsmtool.sim.node.drive_core import Command, ControlMode, DriveCore
-from pmsmtool.sim.node.emergency import Emergency
+from pmsmtool.sim.node.error_control import Emergency
 from pmsmtool.sim.node.position_modes import FOLLOWING_ERROR, PositionModes
 from pmsmtool.sim.node.position_modes import MODES as _POSITION_MODES
 from pmsmtool.sim.node.quick_stop import Stopping

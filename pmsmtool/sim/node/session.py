@@ -12,12 +12,11 @@ from pmsmtool.cia402 import State
 from pmsmtool.firmware.image import crc32
 from pmsmtool.sim.node import memory as storing
 from pmsmtool.sim.node.dictionary import Dictionary, DriveFace, Entry, Refused
-from pmsmtool.sim.node.eds import eds_text
-from pmsmtool.sim.node.emergency import Emergency
-from pmsmtool.sim.node.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from pmsmtool.sim.node.error_control import Emergency, HeartbeatConsumer, HeartbeatProducer
 from pmsmtool.sim.node.lss import ANSWER_ID, REQUEST_ID, LssSlave
 from pmsmtool.sim.node.measurement import Measurement
 from pmsmtool.sim.node.memory import Group, Store, Stored
+from pmsmtool.sim.node.objects import eds_text
 from pmsmtool.sim.node.parameter_set import ParameterImage, ParameterSet
 from pmsmtool.sim.node.pdo import ProcessData
 from pmsmtool.sim.node.power_drive import PDO_MISSED, Plant, PowerDrive
