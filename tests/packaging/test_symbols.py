@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Reading exports: on libraries that a compiler makes here, and on PE and Mach-O files made by hand."""
+"""Reading exports: on libraries that a compiler makes here, and on one of each other system."""
 
 from __future__ import annotations
 
-import struct
+import base64
 import subprocess
 import sys
+import zlib
 from pathlib import Path
 
 import pytest
@@ -39,64 +40,43 @@ def test_elf_object_tells_shown_hidden_and_missing(tmp_path: Path) -> None:
     assert (binary.platform, binary.signed) == ("linux", False)
 
 
-def pe_file(names: list[bytes], machine: int = 0x8664) -> bytes:
-    """A PE32+ image with one section that holds an export directory (PE/COFF specification, section 6.3)."""
-    section, raw = 0x1000, 0x200
-    texts = bytearray()
-    pointers = b""
-    for name in names:
-        pointers += struct.pack("<I", section + 40 + 4 * len(names) + len(texts))
-        texts += name + b"\0"
-    directory = struct.pack("<IIHHIIIIIII", 0, 0, 0, 0, 0, 1, len(names), len(names), 0, section + 40, 0)
-    body = directory + pointers + bytes(texts)
-    optional = struct.pack("<H", 0x20B).ljust(112, b"\0") + struct.pack("<II", section, len(body))
-    header = b"PE\0\0" + struct.pack("<HHIIIHH", machine, 1, 0, 0, 0, len(optional), 0x2000)
-    table = b".edata\0\0" + struct.pack("<IIII", len(body), section, len(body), raw) + bytes(16)
-    head = b"MZ".ljust(0x3C, b"\0") + struct.pack("<I", 0x40) + header + optional + table
-    return head.ljust(raw, b"\0") + body
-
-
-def macho_file(machine: int = 0x0100000C, *, signed: bool) -> bytes:
-    """A 64-bit dylib with an export trie of _pmsm_a and _pmsm_bc, and a symbol table with one undefined name."""
-    trie = bytearray(b"\0\1_pmsm_\0")  # root: not a symbol, one edge "_pmsm_" to the node behind it
-    trie.append(len(trie) + 1)
-    inner = len(trie)
-    edges = [b"a", b"bc"]
-    leaves_at = inner + 2 + sum(len(edge) + 2 for edge in edges)
-    trie += b"\0" + bytes([len(edges)])
-    for k, edge in enumerate(edges):
-        trie += edge + b"\0" + bytes([leaves_at + 4 * k])
-    trie += b"\2\0\1\0" * len(edges)  # leaf: two bytes of terminal information, no edges
-    strings = b"\0_memcpy\0"
-    symbol = struct.pack("<IBBHQ", 1, 0x01, 0, 0, 0)
-    commands = 2 + signed
-    data_at = 32 + 16 + 24 + (16 if signed else 0)
-    trie_command = struct.pack("<IIII", 0x80000033, 16, data_at, len(trie))
-    symbols_at = data_at + len(trie)
-    table = struct.pack("<IIIIII", 0x2, 24, symbols_at, 1, symbols_at + len(symbol), len(strings))
-    signature = struct.pack("<IIII", 0x1D, 16, 0, 0) if signed else b""
-    head = b"\xcf\xfa\xed\xfe" + struct.pack("<IIIIIII", machine, 0, 6, commands, 0, 0, 0)
-    return head + trie_command + table + signature + bytes(trie) + symbol + strings
-
-
-def test_pe_exports() -> None:
-    binary = read_binary(pe_file([b"pmsm_a", b"pmsm_bc"]))
-    assert (binary.platform, binary.machine) == ("win32", "x86_64")
-    assert binary.exported == {"pmsm_a", "pmsm_bc"}
-    assert read_binary(pe_file([b"pmsm_a"], 0xAA64)).machine == "aarch64"
-
-
-def test_macho_exports() -> None:
-    binary = read_binary(macho_file(signed=True))
-    assert (binary.platform, binary.machine, binary.signed) == ("darwin", "aarch64", True)
-    assert binary.exported == {"pmsm_a", "pmsm_bc"}
-    assert binary.undefined == {"memcpy"}
-    assert not read_binary(macho_file(0x01000007, signed=False)).signed
-
-
-@pytest.mark.parametrize(
-    "data", [b"", b"\x7fELF\x01\x01", b"\x7fELF\x02\x01\0", b"MZ\0\0", b"\xcf\xfa\xed\xfe\0", b"#!/bin/sh"]
+PE = (
+    "eNrzjapgYGRgYGBhQAUODIRBBRDzye/iY9jCeVZxB6PPWcWQjMxihYKi/PSixFyF5MS8vPwShaRUhaLSPIXMPAUX/2CF3PyUVD0VBoYAVwaGlD"
+    "YWBnOn8vMw8z4wKClwM/ExMDABOWwQMQEBEAFmNjAyQNlMcGk4zRCA8AQTQwIjTBOMwuRDmAoKDAz22DwHDAAJbOIGDAwyDNQDeiWpFSVAWhrJ"
+    "b+iRAXRigl5RSmJJIgNDAVQAOYyQnOygl1SamZOSmSIDdStYHQcWdQUQ8yRgkQ1Sx4WpjmEUDGsQ6tH5tPNE7GF++RY4fwcoo8UePjMKhj/4Dw"
+    "Ww9IDORwYewHIHlDRg2A/IDwLiMCCu1EvJyQGXYBGg0omhILc4Nx5YvjCyMLGyMDMGwOjRHDf4AKwOFhgNipEHgJHOAcQJCpC2ljQQZyiMBstI"
+    "AQDceM7+"
 )
+"""`int pmsm_a(int x) { return x; }` with an entry, by ziglang 0.14.1: cc -target x86_64-windows-gnu -nostdlib -O2 -s
+-shared; packed by zlib."""
+MACHO = (
+    "eNrt3E9oHFUcwPHfTrLJhsZkA6lJqNUatGAKSQwRKpGYtqkxqG1DggSCPnfZTXZ0/7l/NHuwLoFCD1IST9WDSimFonjQetAWTMSrjYitnkpLEY"
+    "PU6kHaJJTWN7tvt5NtEj3p5fuBt29+89785je/2c0xi6u/364X8YhWo4dfj5+rRY4UjkTa9DiqV5Ua2z8+JvdIbl0/9ppRbc4rlQlPZ+7uq8y3"
+    "bDY2u2LLnbha8u5QqXQmG0xvmK/ea2ZX7M7nM/nq1+RTkXA0GU6tk6/V5HvEFW9eXzb+ph0PKTs+mVgn31MmX6//bmzJxpz3cLyQZ3DP2B617+"
+    "CB0WK2AfM8pY0VcZUZHvNulZpKZNbU+c/5qlz7a0wud11L5TyuBdMN/wZxqS6rXEc0oNK5WDARVclMasN8PlfsrqtW1vZPqVAgE6h8Ttf7r8jn"
+    "q8i3Xv+fLeR5fvjAc/sHh0vvcn5t30vxtCnGU9Gvdl15t9nn3Nun51Y97zDXObPTo249H9LzTtOzvFl/rCJ2btNqYieff0EkouctUry+tMcyv8"
+    "Ua2fx7Jgvr96HBqc38Xrqy6VRX1A52hXLRkFm/z6y3lvMXnzxn1jvc3wWtx+wv9kZX62ksHJufhWwzua7NnBpo/K3n2KefNHw489GrV5z7715z"
+    "nyGvk6Vckx6juXQmHOvc26nrs4PFfNtLfdPPt+y0v0pd1P1o1udm/T3Nc2I9dPGQc2wNrDjHI/r48XaZ+3Po69PdrvN6T+vKnTstpSd8wNTrni"
+    "3z96tXisNT+q2b77xfX1lffPJNXwUAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAD+e91eegAAAAAAAAAAAAAA"
+    "AAAAAAAAAAAAAAAAwP+tqV1GnPl1GQjloiGVzmSDKmjHQ+GUjDTNSkoGVMxOp+34lPTP6o0eJV6xkrF0TEmTkjaxAvJkUPrFikWUTmEHVSQccC"
+    "7fp0LphIoE4qFoWIarZLlOquRWnVTL0bxlPsWjUzY4H+b/EEw4ca2IL2/q06NRry9XF+M2E98ycZ8Tu/a/UBE/LMV7lHQU4/KpGj1qzVxQelql"
+    "MpFs/DVRhUcNmDlYXpd72qVUZQeUcregcEEyZb8RyITL9axeqp/X01+uMpv1Od0ZuSyWfkhLnONX9Bg36/rkQn6HJQ3/7g1vTZaOcp2F6mT3zW"
+    "1vLc7GWz7b+fb5R68fudaXv7F977Rn/P6lE1fG+8++ePDXL96/calvcmJq+p1vVo6/+/HM4dWrJ6d6d/WduXru2MTtL3+4sOuD2bnQe+e+zSae"
+    "PrvYcfO7+dEfn/ml++XlEy2Hvx+8fjL80h9Dpy5/nrDHf/pKnojGY+eX7DNb6k7nwpMXHvQ5tfwN1yYkqw=="
+)
+"""The same, and `double pmsm_b(double x) { return missing(x); }`: -target aarch64-macos.11.0 -undefined
+dynamic_lookup."""
+
+
+def test_libraries_of_other_systems() -> None:
+    dll, dylib = (read_binary(zlib.decompress(base64.b64decode(text))) for text in (PE, MACHO))
+    assert dll == library("win32", "x86_64", {"pmsm_a"}, signed=False)
+    assert (dylib.platform, dylib.machine, dylib.signed) == ("darwin", "aarch64", True)
+    assert dylib.exported - cross_wheels.LINKER_SYMBOLS == {"pmsm_a", "pmsm_b"}
+    assert "missing" in dylib.undefined
+
+
+@pytest.mark.parametrize("data", [b"", b"\x7fELF\x02\x01\0", b"MZ\0\0", b"\xcf\xfa\xed\xfe\0", b"#!/bin/sh"])
 def test_what_is_no_library_is_refused(data: bytes) -> None:
     with pytest.raises(ValueError, match=r"not a 64-bit library|damaged binary"):
         read_binary(data)
