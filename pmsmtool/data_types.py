@@ -8,25 +8,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class DataType:
-    """One data type.
-
-    Attributes
-    ----------
-    name, short : str
-        As the standard writes it, and as object dictionaries abbreviate it.
-    code : int
-        Index in the object dictionary.
-    size : int
-        Bytes on the wire; 0: any number.
-    letter : str
-        ``struct`` letter of a number; empty: no number.
-    """
+    """One data type."""
 
     name: str
     short: str
+    """As the standard writes it, and as object dictionaries abbreviate it."""
     code: int
+    """Index in the object dictionary."""
     size: int
+    """Bytes on the wire; 0: any number."""
     letter: str
+    """``struct`` letter of a number; empty: no number."""
 
     @property
     def is_float(self) -> bool:

@@ -44,53 +44,36 @@ class Acceptance:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """What one stage did.
-
-    Attributes
-    ----------
-    name : str
-        ``identify``, ``tune``, ``lut``, ``margins``, ``flash``, ``verify`` ...
-    status : Status
-        ``pass`` only when every acceptance holds; ``partial``: they hold, but something asked for could not be had;
-        ``not available``: the drive lacks what ``note`` names.
-    seconds : float
-        Time the stage took on the bus clock (s).
-    values : sequence of mapping
-        Estimates or results: ``name value std systematic unit`` and whatever else the stage knows, SI.
-    acceptance : sequence of Acceptance
-        The criteria the status follows from.
-    fallbacks : sequence of str
-        Every fallback that was taken, one line each.
-    files : mapping of str to str
-        File name in the run directory -> SHA-256 of its bytes.
-    note : str
-        The error text of a stage that did not pass.
-    summary : str
-        What a person reads in the one line of the stage.
-    comparison : sequence of mapping
-        Rows *data sheet | drive | measured* (``commissioning/contradiction.py``).
-    refused : mapping of str to str
-        Quantity that was asked for and is not given -> its reason.
-    not_checked : sequence of str
-        What the result follows from and this run did not check (``R_s_ohm: data sheet, NOT CHECKED``): each line stands
-        in the headline of the report, and the verdict on a commissioning is then at most partial.
-    accepted : sequence of str
-        What a person accepted although it is outside a limit, with the option that says so; on the first screen.
-    """
+    """What one stage did."""
 
     name: str
+    """``identify``, ``tune``, ``lut``, ``margins``, ``flash``, ``verify`` ..."""
     status: Status
+    """``pass`` only when every acceptance holds; ``partial``: they hold, but something asked for could not be had;
+    ``not available``: the drive lacks what ``note`` names."""
     seconds: float
+    """Time the stage took on the bus clock (s)."""
     values: Sequence[Mapping[str, Any]] = ()
+    """Estimates or results: ``name value std systematic unit`` and whatever else the stage knows, SI."""
     acceptance: Sequence[Acceptance] = ()
+    """The criteria the status follows from."""
     fallbacks: Sequence[str] = ()
+    """Every fallback that was taken, one line each."""
     files: Mapping[str, str] = field(default_factory=dict)
+    """File name in the run directory -> SHA-256 of its bytes."""
     note: str = ""
+    """The error text of a stage that did not pass."""
     summary: str = ""
+    """What a person reads in the one line of the stage."""
     comparison: Sequence[Mapping[str, Any]] = ()
+    """Rows *data sheet | drive | measured* (``commissioning/contradiction.py``)."""
     refused: Mapping[str, str] = field(default_factory=dict)
+    """Quantity that was asked for and is not given -> its reason."""
     not_checked: Sequence[str] = ()
+    """What the result follows from and this run did not check (``R_s_ohm: data sheet, NOT CHECKED``): each line stands
+    in the headline of the report, and the verdict on a commissioning is then at most partial."""
     accepted: Sequence[str] = ()
+    """What a person accepted although it is outside a limit, with the option that says so; on the first screen."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,30 +24,20 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """One allowed unit.
-
-    Attributes
-    ----------
-    symbol : str
-        The spelling used in files, catalogues and JSON.
-    dimension : str
-        What it measures; units of one dimension convert into each other.
-    exponent : int
-        Power of ten between the unit and SI, kept apart so that 1.2mH is exactly 0.0012.
-    factor : float
-        The rest of its SI value (2 pi/60 for rpm).
-    spellings : tuple of str
-        What else a person may write.
-    prefixable : bool
-        Whether a prefix from p to G may stand before it.
-    """
+    """One allowed unit."""
 
     symbol: str
+    """The spelling used in files, catalogues and JSON."""
     dimension: str
+    """What it measures; units of one dimension convert into each other."""
     spellings: tuple[str, ...] = ()
+    """What else a person may write."""
     prefixable: bool = False
+    """Whether a prefix from p to G may stand before it."""
     exponent: int = 0
+    """Power of ten between the unit and SI, kept apart so that 1.2mH is exactly 0.0012."""
     factor: float = 1.0
+    """The rest of its SI value (2 pi/60 for rpm)."""
 
 
 RAD_S_PER_RPM = math.pi / 30.0

@@ -56,22 +56,15 @@ DAMPING_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class AxisRequest:
-    """What is asked of an axis.
-
-    Attributes
-    ----------
-    phase_margin_deg, peak_db : float
-        Least phase margin (degree) and largest |S| (dB) of both loops over the tolerance box.
-    loop_rate_hz : float or None
-        Rate of the drive's speed and position loops (Hz); None: as its map states, else 1 kHz.
-    speed_filter_hz : float or None
-        Its filter on the speed (Hz); None: as the design says for a reference drive, none for others.
-    """
+    """What is asked of an axis."""
 
     phase_margin_deg: float = 45.0
     peak_db: float = 6.0
+    """Least phase margin (degree) and largest |S| (dB) of both loops over the tolerance box."""
     loop_rate_hz: float | None = None
+    """Rate of the drive's speed and position loops (Hz); None: as its map states, else 1 kHz."""
     speed_filter_hz: float | None = None
+    """Its filter on the speed (Hz); None: as the design says for a reference drive, none for others."""
 
     def __post_init__(self) -> None:
         wrong = []
@@ -107,33 +100,22 @@ class AxisRequest:
 
 @dataclass(frozen=True, slots=True)
 class AxisDrive:
-    """What of a drive decides its axis.
-
-    Attributes
-    ----------
-    name : str
-        Of its map.
-    offers : frozenset of str
-        Catalogue names it has objects for.
-    own_core : bool
-        Whether it runs the control of this program: rate, speed estimate and filter are then those of the design.
-    period_s : float or None
-        Period of its loops as its map states (s).
-    amperes : bool
-        Whether its gains are in amperes.
-    holds_torque : bool
-        Whether it holds the torque of an ampere itself.
-    torque_nm : float or None
-        What its own limit of the current gives (N m); None: not known.
-    """
+    """What of a drive decides its axis."""
 
     name: str
+    """Of its map."""
     offers: frozenset[str]
+    """Catalogue names it has objects for."""
     own_core: bool
+    """Whether it runs the control of this program: rate, speed estimate and filter are then those of the design."""
     period_s: float | None = None
+    """Period of its loops as its map states (s)."""
     amperes: bool = False
+    """Whether its gains are in amperes."""
     holds_torque: bool = False
+    """Whether it holds the torque of an ampere itself."""
     torque_nm: float | None = None
+    """What its own limit of the current gives (N m); None: not known."""
 
     @property
     def pid(self) -> bool:

@@ -47,22 +47,15 @@ DERIVATIVE_POLE = 10.0
 
 @dataclass(frozen=True, slots=True)
 class AxisGains:
-    """Gains of both loops, torque at the motor.
-
-    Attributes
-    ----------
-    K_p, K_i : float
-        Of the speed (N m s/rad, N m/rad).
-    K_v : float
-        Of the position (1/s); 0 leaves the position loop open.
-    notch : Notch
-        On the torque.
-    """
+    """Gains of both loops, torque at the motor."""
 
     K_p: float
     K_i: float
+    """Of the speed (N m s/rad, N m/rad)."""
     K_v: float
+    """Of the position (1/s); 0 leaves the position loop open."""
     notch: Notch = NO_NOTCH
+    """On the torque."""
 
     @property
     def pid(self) -> tuple[float, float, float]:
@@ -72,34 +65,23 @@ class AxisGains:
 
 @dataclass(frozen=True, slots=True)
 class AxisPath:
-    """What lies between the controller's torque and what it sees of the shaft.
-
-    Attributes
-    ----------
-    shaft : Mechanics
-        What turns.
-    current : SampledLoop
-        Loop of the q axis, at the control period.
-    decimation : int
-        Control periods per period of both loops.
-    late : int
-        Periods of the loops between a sample and its torque, besides the delay of the current loop.
-    structure : str
-        ``cascade`` or ``pid``.
-    pll_rad_s : float
-        Natural frequency of the drive's tracking filter on the angle, at the control period; 0: the speed is the
-        difference of two angles over a period of the loops.
-    filter_hz : float
-        First-order filter on that speed; 0: none.
-    """
+    """What lies between the controller's torque and what it sees of the shaft."""
 
     shaft: Mechanics
+    """What turns."""
     current: SampledLoop
+    """Loop of the q axis, at the control period."""
     decimation: int
+    """Control periods per period of both loops."""
     late: int = 0
+    """Periods of the loops between a sample and its torque, besides the delay of the current loop."""
     structure: Structure = "cascade"
+    """``cascade`` or ``pid``."""
     pll_rad_s: float = 0.0
+    """Natural frequency of the drive's tracking filter on the angle, at the control period; 0: the speed is the
+    difference of two angles over a period of the loops."""
     filter_hz: float = 0.0
+    """First-order filter on that speed; 0: none."""
 
     @property
     def T(self) -> float:
@@ -123,21 +105,15 @@ def _bandwidth(loop: SampledLoop) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lifted:
-    """The path at the period of the loops: x(k+1) = A x + b u, y = c x + d u, y = (angle, speed seen).
-
-    Attributes
-    ----------
-    A, b, c, d : ndarray
-        Shapes (n, n), (n,), (2, n), (2,).
-    T : float
-        Period (s).
-    """
+    """The path at the period of the loops: x(k+1) = A x + b u, y = c x + d u, y = (angle, speed seen)."""
 
     A: Array
     b: Array
     c: Array
     d: Array
+    """Shapes (n, n), (n,), (2, n), (2,)."""
     T: float
+    """Period (s)."""
 
     def at(self, omega: Array) -> Complex:
         """Return angle and speed seen per torque at angular frequencies (rad/s) of shape (m,); shape (2, m)."""

@@ -47,21 +47,15 @@ class Profile:
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """One move from rest to rest.
-
-    Attributes
-    ----------
-    distance : float
-        Angle (rad), signed.
-    t_jerk, t_acceleration, t_speed : float
-        Times (s): of one ramp of the acceleration, from the first ramp's begin to the second's, and from the begin of
-        the acceleration to that of the braking.
-    """
+    """One move from rest to rest."""
 
     distance: float
+    """Angle (rad), signed."""
     t_jerk: float
     t_acceleration: float
     t_speed: float
+    """Times (s): of one ramp of the acceleration, from the first ramp's begin to the second's, and from the begin of
+    the acceleration to that of the braking."""
 
     @property
     def duration_s(self) -> float:
@@ -180,36 +174,25 @@ SAME_SPEED = 0.1
 
 @dataclass(frozen=True, slots=True)
 class MoveResult:
-    """One move there and back.
-
-    Attributes
-    ----------
-    way_rad : float
-        Angle of the move (rad).
-    error_peak_rad, error_rms_rad : float
-        Largest following error, and its root mean square while the demand moves (rad).
-    settling_s : float
-        Longest time from the end of a demand until the error stays inside 1 % of the way (s); infinity where it does
-        not within the record.
-    error_end_rad : float
-        Largest error left at the end of the record or of a rest (rad).
-    current_peak_a, current_rms_a : float
-        Of the current while the demand moves, without what flowed at rest before (A).
-    moving_s : float
-        Time in which the demand moved (s).
-    samples : int
-        Rows.
-    """
+    """One move there and back."""
 
     way_rad: float
+    """Angle of the move (rad)."""
     error_peak_rad: float
     error_rms_rad: float
+    """Largest following error, and its root mean square while the demand moves (rad)."""
     settling_s: float
+    """Longest time from the end of a demand until the error stays inside 1 % of the way (s); infinity where it does
+    not within the record."""
     error_end_rad: float
+    """Largest error left at the end of the record or of a rest (rad)."""
     current_peak_a: float
     current_rms_a: float
+    """Of the current while the demand moves, without what flowed at rest before (A)."""
     moving_s: float
+    """Time in which the demand moved (s)."""
     samples: int
+    """Rows."""
 
 
 UNITS = {

@@ -270,19 +270,13 @@ def _fastest(box: Box, limits: Limits, shape: Shape, floor: float, loops: Sequen
 
 @dataclass(frozen=True, slots=True)
 class AxisMargins:
-    """What a loop tolerates.
-
-    Attributes
-    ----------
-    loop : LoopMargins
-        As of every other loop of a design.
-    S_peak_db, T_peak_db : float
-        Largest sensitivity and complementary sensitivity (dB).
-    """
+    """What a loop tolerates."""
 
     loop: LoopMargins
+    """As of every other loop of a design."""
     S_peak_db: float
     T_peak_db: float
+    """Largest sensitivity and complementary sensitivity (dB)."""
 
 
 def grid(plant: Lifted, *more: Complex) -> Array:

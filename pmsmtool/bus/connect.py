@@ -231,18 +231,12 @@ def in_time(
 
 @dataclass(frozen=True, slots=True)
 class SetUp:
-    """What an adapter needs on one system.
-
-    Attributes
-    ----------
-    install : str
-        What to install or to run once.
-    type : str
-        The bus options then.
-    """
+    """What an adapter needs on one system."""
 
     install: str
+    """What to install or to run once."""
     type: str
+    """The bus options then."""
 
 
 def _kernel(driver: str) -> SetUp:

@@ -43,28 +43,19 @@ class Adapter:
 
 @dataclass(frozen=True, slots=True)
 class Examination:
-    """Findings on one bus.
-
-    Attributes
-    ----------
-    frames, error_frames : int
-        Heard while only listening.
-    load : float or None
-        Share of the time frames took, from their exact lengths; None without a bit rate.
-    state : str
-        Controller state as the adapter tells it; empty where it does not.
-    nodes : tuple of FoundNode
-        Who answers or was heard.
-    findings : tuple of (str, str)
-        Verdict PASS, WARN or FAIL and its sentence.
-    """
+    """Findings on one bus."""
 
     frames: int
     error_frames: int
+    """Heard while only listening."""
     load: float | None
+    """Share of the time frames took, from their exact lengths; None without a bit rate."""
     state: str
+    """Controller state as the adapter tells it; empty where it does not."""
     nodes: tuple[FoundNode, ...]
+    """Who answers or was heard."""
     findings: tuple[tuple[str, str], ...] = field(default=())
+    """Verdict PASS, WARN or FAIL and its sentence."""
 
 
 def adapters() -> list[Adapter]:

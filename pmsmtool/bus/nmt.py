@@ -70,21 +70,14 @@ def reset_node(connection: Connection, node: int, *, timeout_s: float = BOOT_TIM
 
 @dataclass(frozen=True, slots=True)
 class FoundNode:
-    """One node.
-
-    Attributes
-    ----------
-    node : int
-        Node id.
-    device_type : int or None
-        Object 0x1000; None when it did not answer.
-    nmt_state : NmtState or None
-        From its heartbeat, if one was heard.
-    """
+    """One node."""
 
     node: int
+    """Node id."""
     device_type: int | None
+    """Object 0x1000; None when it did not answer."""
     nmt_state: NmtState | None
+    """From its heartbeat, if one was heard."""
 
     @property
     def is_drive(self) -> bool:

@@ -98,30 +98,20 @@ class Retry(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """What one confirmed transfer took.
-
-    Attributes
-    ----------
-    data : bytes
-        Bytes read or written.
-    mode : Mode
-        How they travelled in the end.
-    tries : int
-        Attempts, 1 when nothing was lost.
-    retransmitted : int
-        Segments of block transfers that travelled again.
-    discarded : int
-        Frames that were not the answer awaited: late, duplicated or foreign.
-    notes : tuple of str
-        One line per retry and fall-back.
-    """
+    """What one confirmed transfer took."""
 
     data: bytes
+    """Bytes read or written."""
     mode: Mode
+    """How they travelled in the end."""
     tries: int = 1
+    """Attempts, 1 when nothing was lost."""
     retransmitted: int = 0
+    """Segments of block transfers that travelled again."""
     discarded: int = 0
+    """Frames that were not the answer awaited: late, duplicated or foreign."""
     notes: tuple[str, ...] = ()
+    """One line per retry and fall-back."""
 
 
 @dataclass(slots=True)

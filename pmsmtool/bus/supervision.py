@@ -47,21 +47,14 @@ class SecondMaster(BusError):
 
 @dataclass(frozen=True, slots=True)
 class Emergency:
-    """One emergency message (CiA 301, section 7.2.7).
-
-    Attributes
-    ----------
-    code : int
-        Error code, 0 for "error reset".
-    register : int
-        Error register 0x1001.
-    detail : bytes
-        Manufacturer's five bytes, fewer when the message was short.
-    """
+    """One emergency message (CiA 301, section 7.2.7)."""
 
     code: int
+    """Error code, 0 for "error reset"."""
     register: int
+    """Error register 0x1001."""
     detail: bytes
+    """Manufacturer's five bytes, fewer when the message was short."""
 
     def __str__(self) -> str:
         text = f"emergency {self.code:#06x} ({error_text(self.code)}), register {self.register:#04x}"

@@ -37,24 +37,16 @@ class Section(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One command.
-
-    Attributes
-    ----------
-    name : str
-        What is typed; kebab-case.
-    target : str
-        ``module:attribute`` of the click command.
-    section : Section
-        Where the help lists it.
-    help : str
-        One sentence; the short help everywhere.
-    """
+    """One command."""
 
     name: str
+    """What is typed; kebab-case."""
     target: str
+    """``module:attribute`` of the click command."""
     section: Section
+    """Where the help lists it."""
     help: str
+    """One sentence; the short help everywhere."""
 
 
 COMMANDS: tuple[Row, ...] = (

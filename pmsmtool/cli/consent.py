@@ -29,21 +29,14 @@ Subject = Literal["motion", "writing"]
 
 @dataclass(frozen=True, slots=True)
 class Consent:
-    """A consent that was given, as the run record keeps it.
-
-    Attributes
-    ----------
-    subject : str
-        ``motion`` or ``writing``.
-    answer : str
-        ``prompt`` when a person typed it, ``--yes`` otherwise.
-    text : tuple of str
-        The lines the consent is about.
-    """
+    """A consent that was given, as the run record keeps it."""
 
     subject: Subject
+    """``motion`` or ``writing``."""
     answer: Literal["prompt", "--yes"]
+    """``prompt`` when a person typed it, ``--yes`` otherwise."""
     text: tuple[str, ...]
+    """The lines the consent is about."""
 
 
 def keep(run: RunDirectory, given: Consent) -> None:

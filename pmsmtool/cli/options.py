@@ -318,31 +318,21 @@ def merged_bus_options(ctx: click.Context) -> BusOptions:
 
 @dataclass(frozen=True, slots=True)
 class MotionOptions:
-    """What a person allows before the machine moves or the drive is written.
-
-    Attributes
-    ----------
-    yes : bool
-        ``--yes`` was typed; what it answers is decided in ``consent``.
-    i_max_apk : float, optional
-        Largest current (A peak).
-    speed_max_rad_s : float, optional
-        Largest mechanical speed (rad/s).
-    shaft : str, optional
-        ``free``, ``locked`` or ``coupled``.
-    serial : int, optional
-        Serial number the drive must have.
-    load, brake : str
-        What pulls on the shaft (``none``, ``gravity``); the holding brake (``open``, ``drive``, ``none``).
-    """
+    """What a person allows before the machine moves or the drive is written."""
 
     yes: bool = False
+    """``--yes`` was typed; what it answers is decided in ``consent``."""
     i_max_apk: float | None = None
+    """Largest current (A peak)."""
     speed_max_rad_s: float | None = None
+    """Largest mechanical speed (rad/s)."""
     shaft: Literal["free", "locked", "coupled"] | None = None
+    """``free``, ``locked`` or ``coupled``."""
     serial: int | None = None
+    """Serial number the drive must have."""
     load: Literal["none", "gravity"] = "none"
     brake: Literal["open", "drive", "none"] = "none"
+    """What pulls on the shaft (``none``, ``gravity``); the holding brake (``open``, ``drive``, ``none``)."""
 
 
 def bus_options(function: Function) -> Function:

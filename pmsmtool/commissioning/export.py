@@ -50,20 +50,14 @@ DECOUPLING_AND_EMF = 3
 
 @dataclass(frozen=True, slots=True)
 class QFormat:
-    """Bases and constants of one motor.
-
-    Attributes
-    ----------
-    I_base, U_base, omega_base : float
-        Base values (A, V, electrical rad/s), powers of two.
-    constants : mapping of str to (int, float)
-        Member of ``pmsm_governor_q_constants`` -> Q4.27 number and its relative rounding error.
-    """
+    """Bases and constants of one motor."""
 
     I_base: float
     U_base: float
     omega_base: float
+    """Base values (A, V, electrical rad/s), powers of two."""
     constants: Mapping[str, tuple[int, float]]
+    """Member of ``pmsm_governor_q_constants`` -> Q4.27 number and its relative rounding error."""
 
 
 def _power_of_two(x: float) -> float:

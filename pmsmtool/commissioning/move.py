@@ -48,26 +48,18 @@ TRACE = "traces/move.npz"
 
 @dataclass(frozen=True, slots=True)
 class ForetoldMove:
-    """A move before it is made.
-
-    Attributes
-    ----------
-    error_least_rad, error_most_rad : float
-        Largest following error over the corners of the tolerance box (rad); the current is not limited in it. The
-        larger end has the way of one period of the loops: demand and position may be seen that far apart.
-    gains : str
-        Whose gains: those that the drive holds, or those of the design where a unit of the held ones is unknown.
-    torque_nm : float
-        Largest torque that the loops ask for, over the same corners (N m).
-    torque_limit_nm : float
-        What the current limit gives on the q axis alone (N m).
-    """
+    """A move before it is made."""
 
     error_least_rad: float
     error_most_rad: float
+    """Largest following error over the corners of the tolerance box (rad); the current is not limited in it. The
+    larger end has the way of one period of the loops: demand and position may be seen that far apart."""
     gains: str
+    """Whose gains: those that the drive holds, or those of the design where a unit of the held ones is unknown."""
     torque_nm: float
+    """Largest torque that the loops ask for, over the same corners (N m)."""
     torque_limit_nm: float
+    """What the current limit gives on the q axis alone (N m)."""
 
     def __str__(self) -> str:
         least, most = (math.degrees(error) for error in (self.error_least_rad, self.error_most_rad))
@@ -155,29 +147,20 @@ def lent_profile(
 
 @dataclass(frozen=True, slots=True)
 class PlannedMove:
-    """Moves there and back on one drive, before they are made.
-
-    Attributes
-    ----------
-    way_rad, times : float, int
-        Of the shaft (rad), and how often.
-    envelope : Envelope
-        Limits.
-    gains, lent : dict of str to float
-        What the drive holds, and what is changed in it for the moves, by catalogue name.
-    find : tuple of float or None
-        Speed and acceleration (rad/s, rad/s2) for which counts are found by the demand.
-    foretold : ForetoldMove or None
-        What a design says of them.
-    """
+    """Moves there and back on one drive, before they are made."""
 
     way_rad: float
     times: int
+    """Of the shaft (rad), and how often."""
     envelope: Envelope
+    """Limits."""
     gains: dict[str, float]
     lent: dict[str, float]
+    """What the drive holds, and what is changed in it for the moves, by catalogue name."""
     find: tuple[float, float] | None
+    """Speed and acceleration (rad/s, rad/s2) for which counts are found by the demand."""
     foretold: ForetoldMove | None
+    """What a design says of them."""
 
     @property
     def error_limit_rad(self) -> float:

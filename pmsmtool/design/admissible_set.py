@@ -60,29 +60,20 @@ def matrix_exponential(X: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class PredictionModel:
-    """Machine and controller as the governor predicts them (constant parameters, Euler).
-
-    Attributes
-    ----------
-    R : float
-        Resistance (ohm).
-    L_d, L_q : float
-        Inductances (H).
-    psi_f : float
-        Magnet flux linkage (Wb).
-    T_s : float
-        Control period (s).
-    gains_d, gains_q : CurrentGains
-        PI gains.
-    """
+    """Machine and controller as the governor predicts them (constant parameters, Euler)."""
 
     R: float
+    """Resistance (ohm)."""
     L_d: float
     L_q: float
+    """Inductances (H)."""
     psi_f: float
+    """Magnet flux linkage (Wb)."""
     T_s: float
+    """Control period (s)."""
     gains_d: CurrentGains
     gains_q: CurrentGains
+    """PI gains."""
 
     def system_matrix(self) -> Array:
         """Return A of (20), shape (6, 6)."""
@@ -154,18 +145,12 @@ class StateBounds:
 
 @dataclass(frozen=True, slots=True)
 class Horizon:
-    """Horizon of a design.
-
-    Attributes
-    ----------
-    k_max : int or None
-        None: not finitely determined below ``HORIZON_CAP``.
-    eps : float or None
-        Tightening of the steady-state row; None without that row.
-    """
+    """Horizon of a design."""
 
     k_max: int | None
+    """None: not finitely determined below ``HORIZON_CAP``."""
     eps: float | None
+    """Tightening of the steady-state row; None without that row."""
 
     @property
     def by_tolerance(self) -> bool:

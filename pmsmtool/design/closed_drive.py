@@ -68,37 +68,25 @@ BAND = 0.02
 
 @dataclass(frozen=True, slots=True)
 class ClosedDrive:
-    """What a closed drive offers and what is known of its control.
-
-    Attributes
-    ----------
-    name : str
-        Family.
-    offers : frozenset of str
-        Catalogue names it has an object for.
-    bandwidth_hz : float or None
-        Bandwidth of its current control where its gains cannot be written.
-    rise_s : float
-        Largest time from zero to the torque limit.
-    speed_rpm : float or None
-        Speed up to which the guarantee is to hold; None: where torque times speed is largest.
-    acceleration_rpm_per_s : float or None
-        Largest acceleration, whatever causes it; None: what the torque limit does to the least inertia.
-    stair_s, filter_s : float
-        Time between two steps of its slope; time constant of a set-point filter it is known to have.
-    decoupled : bool or None
-        Whether its current control adds omega (L i + psi); None: not known, both are held to.
-    """
+    """What a closed drive offers and what is known of its control."""
 
     name: str
+    """Family."""
     offers: frozenset[str]
+    """Catalogue names it has an object for."""
     bandwidth_hz: float | None = None
+    """Bandwidth of its current control where its gains cannot be written."""
     rise_s: float = RISE_S
+    """Largest time from zero to the torque limit."""
     speed_rpm: float | None = None
+    """Speed up to which the guarantee is to hold; None: where torque times speed is largest."""
     acceleration_rpm_per_s: float | None = None
+    """Largest acceleration, whatever causes it; None: what the torque limit does to the least inertia."""
     stair_s: float = STAIR_S
     filter_s: float = 0.0
+    """Time between two steps of its slope; time constant of a set-point filter it is known to have."""
     decoupled: bool | None = None
+    """Whether its current control adds omega (L i + psi); None: not known, both are held to."""
 
     def __post_init__(self) -> None:
         numbers = {"bandwidth_hz": self.bandwidth_hz, "rise_s": self.rise_s, "speed_rpm": self.speed_rpm,
@@ -126,35 +114,26 @@ class ClosedDrive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guarantee:
-    """In which range the voltage demand never exceeds the limit, and what that costs.
-
-    Attributes
-    ----------
-    tau_nm, n_rpm, slope_nm_per_s, acceleration_rpm_per_s : float
-        The range: torque, speed, slope of the set-point, acceleration.
-    I_apk, deviation_a : float
-        Largest current of the reference, and how far the current may stray from it (A).
-    demand_v, limit_v, V_max_v : float
-        Bound of the demand; what it is held to: the least V_max less margin and dead time; the least V_max.
-    speeds_rpm, closed_nm, governed_nm : ndarray, shape (m,)
-        Largest torque over speed: of a limit that followed the speed, and of the full governor.
-    governed_rise_s : float
-        Time from zero to ``tau_nm`` at ``n_rpm`` in the shortest possible way, which the full governor takes.
-    """
+    """In which range the voltage demand never exceeds the limit, and what that costs."""
 
     tau_nm: float
     n_rpm: float
     slope_nm_per_s: float
     acceleration_rpm_per_s: float
+    """The range: torque, speed, slope of the set-point, acceleration."""
     I_apk: float
     deviation_a: float
+    """Largest current of the reference, and how far the current may stray from it (A)."""
     demand_v: float
     limit_v: float
     V_max_v: float
+    """Bound of the demand; what it is held to: the least V_max less margin and dead time; the least V_max."""
     speeds_rpm: Array
     closed_nm: Array
     governed_nm: Array
+    """Largest torque over speed: of a limit that followed the speed, and of the full governor. Shape (m,)."""
     governed_rise_s: float
+    """Time from zero to ``tau_nm`` at ``n_rpm`` in the shortest possible way, which the full governor takes."""
 
     @property
     def torque_loss(self) -> float:

@@ -38,52 +38,34 @@ Scalar = str | bool | int | float
 
 @dataclass(frozen=True, slots=True)
 class DesignValue:
-    """One number of a design.
-
-    Attributes
-    ----------
-    value : float
-        In the catalogue's unit.
-    method : str
-        How it was found, one line.
-    loop : str
-        Loop whose margins it decides (a key of ``Design.loops``); empty for none.
-    """
+    """One number of a design."""
 
     value: float
+    """In the catalogue's unit."""
     method: str
+    """How it was found, one line."""
     loop: str = ""
+    """Loop whose margins it decides (a key of ``Design.loops``); empty for none."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Design(Summarised):
-    """A complete set of drive parameters with their reasons.
-
-    Attributes
-    ----------
-    machine : MachineFile
-        What it was designed for.
-    request : mapping of str to scalar
-        What was asked (``tune.TuneRequest``).
-    values : mapping of str to DesignValue
-        Catalogue name -> number; every row of the catalogue.
-    loops : mapping of str to LoopMargins
-        Achieved margins: ``current_d``, ``current_q``, ``speed`` and variants.
-    facts : mapping of str to scalar
-        Other results worth keeping, unit in the name.
-    notes : tuple of str
-        What a person must know: assumptions and fall-backs.
-    tables : mapping of str to sequence of float
-        Look-up axes and tables (``params.parameter_set.TABLE_NAMES``); empty without one.
-    """
+    """A complete set of drive parameters with their reasons."""
 
     machine: MachineFile
+    """What it was designed for."""
     request: Mapping[str, Scalar]
+    """What was asked (``tune.TuneRequest``)."""
     values: Mapping[str, DesignValue]
+    """Catalogue name -> number; every row of the catalogue."""
     loops: Mapping[str, LoopMargins] = field(default_factory=dict)
+    """Achieved margins: ``current_d``, ``current_q``, ``speed`` and variants."""
     facts: Mapping[str, Scalar] = field(default_factory=dict)
+    """Other results worth keeping, unit in the name."""
     notes: tuple[str, ...] = ()
+    """What a person must know: assumptions and fall-backs."""
     tables: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    """Look-up axes and tables (``params.parameter_set.TABLE_NAMES``); empty without one."""
 
     def __getitem__(self, name: str) -> float:
         """Return one value by catalogue name; raises ``KeyError`` with the nearest names where there is none."""

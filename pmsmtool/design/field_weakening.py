@@ -45,22 +45,15 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class FieldWeakeningDesign:
-    """Values of field weakening with facts for the design file.
-
-    Attributes
-    ----------
-    values : mapping of str to DesignValue
-        Catalogue values.
-    facts : mapping of str to scalar
-        Predicted voltage overshoot and the like.
-    ramp_limit_rpm_per_s : float
-        Speed slope at which the voltage overshoot between two calls spends the reserve; infinite without a reserve to
-        spend or without field weakening.
-    """
+    """Values of field weakening with facts for the design file."""
 
     values: Mapping[str, DesignValue]
+    """Catalogue values."""
     facts: Mapping[str, Scalar]
+    """Predicted voltage overshoot and the like."""
     ramp_limit_rpm_per_s: float
+    """Speed slope at which the voltage overshoot between two calls spends the reserve; infinite without a reserve to
+    spend or without field weakening."""
 
 
 def design_field_weakening(source: MachineFile, rated: Ratings, mode: str, margin: float) -> FieldWeakeningDesign:

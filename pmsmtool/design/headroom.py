@@ -31,31 +31,22 @@ SPEEDS = 13
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OperatingCells:
-    """Nominal references and what is needed to evaluate them on other machines, each shape (cells,).
-
-    Attributes
-    ----------
-    torque_nm, speed_rpm, omega_e : ndarray
-        Torque achieved nominally (N m), mechanical speed (rpm), electrical speed (rad/s).
-    i_d_a, i_q_a : ndarray
-        References (A peak).
-    psi_d_wb, psi_q_wb : ndarray
-        Nominal fluxes there (Wb).
-    jacobian : ndarray, shape (4, cells)
-        Their derivatives by i_d, i_q (H): dd, dq, qd, qq.
-    unreachable : tuple of str
-        Points that were left out, because the nominal machine does not reach their torque.
-    """
+    """Nominal references and what is needed to evaluate them on other machines, each shape (cells,)."""
 
     torque_nm: Array
     speed_rpm: Array
     omega_e: Array
+    """Torque achieved nominally (N m), mechanical speed (rpm), electrical speed (rad/s)."""
     i_d_a: Array
     i_q_a: Array
+    """References (A peak)."""
     psi_d_wb: Array
     psi_q_wb: Array
+    """Nominal fluxes there (Wb)."""
     jacobian: Array
+    """Their derivatives by i_d, i_q (H): dd, dq, qd, qq. Shape (4, cells)."""
     unreachable: tuple[str, ...] = ()
+    """Points that were left out, because the nominal machine does not reach their torque."""
 
     def name(self, cell: int) -> str:
         """Return one cell in words."""
@@ -99,21 +90,14 @@ def operating_cells(source: MachineFile, rated: Ratings, voltage_margin: float) 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Headroom:
-    """Headroom of n samples, each shape (n, cells) but the last.
-
-    Attributes
-    ----------
-    voltage : ndarray
-        1 - |v| / V_max.
-    current : ndarray
-        1 - |i| scaled to the wanted torque / I_max; cells of rated torque share only.
-    thermal : ndarray, shape (n,)
-        1 - copper loss of rated torque / copper loss of the continuous current at the winding limit.
-    """
+    """Headroom of n samples, each shape (n, cells) but the last."""
 
     voltage: Array
+    """1 - |v| / V_max."""
     current: Array
+    """1 - |i| scaled to the wanted torque / I_max; cells of rated torque share only."""
     thermal: Array
+    """1 - copper loss of rated torque / copper loss of the continuous current at the winding limit. Shape (n,)."""
 
 
 @dataclass(frozen=True, slots=True)

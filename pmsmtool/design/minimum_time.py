@@ -36,24 +36,17 @@ LONGEST_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class TransferProblem:
-    """Machine, speed and voltage of a current transfer.
-
-    Attributes
-    ----------
-    R, L_d, L_q, psi_f : float
-        Constants (ohm, H, H, Wb).
-    omega_e : float
-        Electrical speed (rad/s), constant.
-    V_max : float
-        Radius of the circle (V); the hexagon has this radius as its inscribed circle.
-    """
+    """Machine, speed and voltage of a current transfer."""
 
     R: float
     L_d: float
     L_q: float
     psi_f: float
+    """Constants (ohm, H, H, Wb)."""
     omega_e: float
+    """Electrical speed (rad/s), constant."""
     V_max: float
+    """Radius of the circle (V); the hexagon has this radius as its inscribed circle."""
 
     def system(self) -> tuple[Array, Array, Array]:
         """Return F, G and e."""

@@ -58,35 +58,24 @@ def design_library() -> Any:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OperatingMachine:
-    """A machine at fixed temperatures.
-
-    Attributes
-    ----------
-    pole_pairs : int
-        Pole pairs.
-    R : float
-        Loop resistance (ohm) at the winding temperature.
-    L_d, L_q : float
-        Apparent inductances (H) of a constant machine; unused with a map.
-    psi_f : float
-        Magnet flux linkage (Wb) at the magnet temperature.
-    flux_map : FluxMap or None
-        Saturated machine, at the map's own magnet temperature.
-    psi_shift : float
-        Added to psi_d of the map (Wb).
-    loss_map : FluxMap or None
-        Iron loss P_fe = c_h f + c_e f^2 with f the electrical frequency (Hz); ``psi_d_wb`` of this map holds c_h
-        (W/Hz), ``psi_q_wb`` holds c_e (W/Hz^2).
-    """
+    """A machine at fixed temperatures."""
 
     pole_pairs: int
+    """Pole pairs."""
     R: float
+    """Loop resistance (ohm) at the winding temperature."""
     L_d: float
     L_q: float
+    """Apparent inductances (H) of a constant machine; unused with a map."""
     psi_f: float
+    """Magnet flux linkage (Wb) at the magnet temperature."""
     flux_map: FluxMap | None = None
+    """Saturated machine, at the map's own magnet temperature."""
     psi_shift: float = 0.0
+    """Added to psi_d of the map (Wb)."""
     loss_map: FluxMap | None = None
+    """Iron loss P_fe = c_h f + c_e f^2 with f the electrical frequency (Hz); ``psi_d_wb`` of this map holds c_h
+    (W/Hz), ``psi_q_wb`` holds c_e (W/Hz^2)."""
 
     def flux(self, i_d_a: ArrayLike, i_q_a: ArrayLike) -> tuple[Array, Array]:
         """Return psi_d, psi_q (Wb) at currents (A peak) of any shape."""

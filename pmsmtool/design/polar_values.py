@@ -227,29 +227,21 @@ def design_or_none(machine: SurfaceMachine, V_max: float, rpm: float, torque_nm:
 
 @dataclass(frozen=True, slots=True)
 class ScheduledGains:
-    """Gains at one operating point; a current is A peak, a voltage V peak.
-
-    Attributes
-    ----------
-    rpm, torque_nm : float
-        The point.
-    phase, amplitude : tuple of float
-        K_p, K_i, K_d and a of the PIDs.
-    K_P21, K_I21, K_P12, K_I12 : float
-        PI gains of the linear range, (28)-(31).
-    direct_phase : float
-        Gain of the phase PID at high frequency, K_p + K_d a (rad/A): what a step of the reference kicks with.
-    """
+    """Gains at one operating point; a current is A peak, a voltage V peak."""
 
     rpm: float
     torque_nm: float
+    """The point."""
     phase: tuple[float, float, float, float]
     amplitude: tuple[float, float, float, float]
+    """K_p, K_i, K_d and a of the PIDs."""
     K_P21: float
     K_I21: float
     K_P12: float
     K_I12: float
+    """PI gains of the linear range, (28)-(31)."""
     direct_phase: float
+    """Gain of the phase PID at high frequency, K_p + K_d a (rad/A): what a step of the reference kicks with."""
 
 
 def gain_schedule(

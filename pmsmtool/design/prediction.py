@@ -41,22 +41,15 @@ NEARBY = 128
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Predicted band of one signal of one experiment.
-
-    Attributes
-    ----------
-    mean, std : ndarray, shape (n,)
-        Of the simulated runs, the floor included.
-    factor : float
-        Half width over ``std``, without ripple.
-    ripple : float
-        What the record itself shows of it, in the signal's unit.
-    """
+    """Predicted band of one signal of one experiment."""
 
     mean: Array
     std: Array
+    """Of the simulated runs, the floor included. Shape (n,)."""
     factor: float
+    """Half width over ``std``, without ripple."""
     ripple: float = 0.0
+    """What the record itself shows of it, in the signal's unit."""
 
     @property
     def half(self) -> Array:
@@ -83,29 +76,21 @@ class Band:
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A derived quantity: the amplitude of a signature in the deviation, by generalised least squares.
-
-    Attributes
-    ----------
-    nominal : float
-        Value without deviation.
-    unit : str
-        Unit of the value.
-    low, high : float
-        Predicted band.
-    signature : mapping of (experiment, signal) to ndarray
-        Deviation per amplitude, already over the covariance: the inner product with a deviation is the amplitude.
-    below, above : str
-        What is wrong when it lies below its band, or above; empty when nothing is known to do that.
-    """
+    """A derived quantity: the amplitude of a signature in the deviation, by generalised least squares."""
 
     nominal: float
+    """Value without deviation."""
     unit: str
+    """Unit of the value."""
     low: float
     high: float
+    """Predicted band."""
     signature: Mapping[tuple[str, str], Array]
+    """Deviation per amplitude, already over the covariance: the inner product with a deviation is the amplitude.
+    Mapping of (experiment, signal) to ndarray."""
     below: str = ""
     above: str = ""
+    """What is wrong when it lies below its band, or above; empty when nothing is known to do that."""
 
     def of(self, deviation: Mapping[tuple[str, str], Array]) -> float:
         """Return the quantity that a deviation from the mean shows."""
@@ -128,27 +113,18 @@ class Fault:
 
 @dataclass(frozen=True, slots=True)
 class Prediction:
-    """What a drive will do, before it does it.
-
-    Attributes
-    ----------
-    t_s : mapping of str to ndarray
-        Time base of each experiment, in the order they are run.
-    bands : mapping of (experiment, signal) to Band
-        What is judged.
-    quantities : mapping of str to Quantity
-        Derived quantities with their bands.
-    faults : mapping of str to Fault
-        Signatures of what may be wrong.
-    facts : mapping
-        Design hash, conditions, seed, number of runs; JSON-serialisable.
-    """
+    """What a drive will do, before it does it."""
 
     t_s: Mapping[str, Array]
+    """Time base of each experiment, in the order they are run."""
     bands: Mapping[tuple[str, str], Band]
+    """What is judged. Mapping of (experiment, signal) to Band."""
     quantities: Mapping[str, Quantity] = field(default_factory=dict)
+    """Derived quantities with their bands."""
     faults: Mapping[str, Fault] = field(default_factory=dict)
+    """Signatures of what may be wrong."""
     facts: Mapping[str, Any] = field(default_factory=dict)
+    """Design hash, conditions, seed, number of runs; JSON-serialisable."""
 
     def signals(self, experiment: str) -> tuple[str, ...]:
         """Return the judged signals of an experiment."""

@@ -51,39 +51,27 @@ GIVEN = "machine file"
 
 @dataclass(frozen=True, slots=True)
 class Ratings:
-    """Currents, speed and torque the design works with.
-
-    Attributes
-    ----------
-    I_nom_apk, I_max_apk, I_cont_apk : float
-        Rated, time-limited and continuous current (A peak).
-    n_max_rpm : float
-        Largest mechanical speed (rpm).
-    tau_max_nm : float
-        Largest torque the speed controller may ask for (N m).
-    i_d_min_a : float
-        Most negative i_d (A).
-    U_dc_max_v, n_trip_rpm : float
-        Overvoltage (V) and overspeed (rpm) trip.
-    reaction : FaultReaction
-        What a fault does to the inverter.
-    base_speed_rpm : float
-        Speed at which rated torque takes the whole voltage (rpm).
-    methods : mapping of str to str
-        How each of them was found.
-    """
+    """Currents, speed and torque the design works with."""
 
     I_nom_apk: float
     I_max_apk: float
     I_cont_apk: float
+    """Rated, time-limited and continuous current (A peak)."""
     n_max_rpm: float
+    """Largest mechanical speed (rpm)."""
     tau_max_nm: float
+    """Largest torque the speed controller may ask for (N m)."""
     i_d_min_a: float
+    """Most negative i_d (A)."""
     U_dc_max_v: float
     n_trip_rpm: float
+    """Overvoltage (V) and overspeed (rpm) trip."""
     reaction: FaultReaction
+    """What a fault does to the inverter."""
     base_speed_rpm: float
+    """Speed at which rated torque takes the whole voltage (rpm)."""
     methods: Mapping[str, str]
+    """How each of them was found."""
 
 
 def ratings(source: MachineFile, V_limit_v: float, protection: Protection | None = None) -> Ratings:

@@ -41,31 +41,21 @@ ROUNDS, CONVERGED, LARGEST = 200, 1e-6, 1e9
 
 @dataclass(frozen=True, slots=True)
 class CurrentLoops:
-    """What is known of a closed drive's current control.
-
-    Attributes
-    ----------
-    K_p, K_i : tuple of float
-        Gains of d and q (V/A, V/(A s)).
-    T_s : float
-        Control period (s).
-    delay_periods : int
-        Whole periods from the sample to the start of the voltage it leads to (0 or 1).
-    decoupled : bool
-        Whether it adds omega (L i + psi) of its own motor data.
-    stair_s : float
-        Time between two steps of its torque slope (s).
-    filter_s : float
-        Time constant of its set-point filter, 0 without one (s).
-    """
+    """What is known of a closed drive's current control."""
 
     K_p: tuple[float, float]
     K_i: tuple[float, float]
+    """Gains of d and q (V/A, V/(A s))."""
     T_s: float
+    """Control period (s)."""
     delay_periods: int = 1
+    """Whole periods from the sample to the start of the voltage it leads to (0 or 1)."""
     decoupled: bool = False
+    """Whether it adds omega (L i + psi) of its own motor data."""
     stair_s: float = 1e-3
+    """Time between two steps of its torque slope (s)."""
     filter_s: float = 0.0
+    """Time constant of its set-point filter, 0 without one (s)."""
 
 
 @dataclass(frozen=True, slots=True)

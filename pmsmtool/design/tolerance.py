@@ -58,26 +58,18 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True)
 class ToleranceBox:
-    """Ranges of everything that varies.
-
-    Attributes
-    ----------
-    factors : mapping of str to Deviation
-        Relative deviation of each machine key of ``PARAMETERS`` that is known.
-    encoder_rad : Deviation
-        Electrical encoder offset (rad).
-    T_winding_c, T_magnet_c, U_dc_v : tuple of float
-        Ranges.
-    notes : tuple of str
-        What was assumed.
-    """
+    """Ranges of everything that varies."""
 
     factors: Mapping[str, Deviation]
+    """Relative deviation of each machine key of ``PARAMETERS`` that is known."""
     encoder_rad: Deviation
+    """Electrical encoder offset (rad)."""
     T_winding_c: tuple[float, float]
     T_magnet_c: tuple[float, float]
     U_dc_v: tuple[float, float]
+    """Ranges."""
     notes: tuple[str, ...] = ()
+    """What was assumed."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -117,18 +109,12 @@ class ToleranceBox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Samples:
-    """Rows of varied quantities.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Columns: factors over nominal, then absolute quantities.
-    rows : ndarray, shape (n, columns)
-        One sample per row.
-    """
+    """Rows of varied quantities."""
 
     names: tuple[str, ...]
+    """Columns: factors over nominal, then absolute quantities."""
     rows: Array
+    """One sample per row. Shape (n, columns)."""
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -217,23 +217,16 @@ OFFSETS = (DriveObject(0x60B0, 0, "i"), DriveObject(0x60B1, 0, "i"), DriveObject
 
 
 class OwnLimits(NamedTuple):
-    """The drive's own limits.
-
-    Attributes
-    ----------
-    current, speed : Quantity or None
-        The objects in use, None where the drive has none.
-    most_apk, most_rpm : float
-        What they allow after they were lowered to the envelope (A peak, rpm).
-    refused : tuple of str
-        Limits that the drive does not let be lowered, one line each.
-    """
+    """The drive's own limits."""
 
     current: Quantity | None
     speed: Quantity | None
+    """The objects in use, None where the drive has none."""
     most_apk: float
     most_rpm: float
+    """What they allow after they were lowered to the envelope (A peak, rpm)."""
     refused: tuple[str, ...] = ()
+    """Limits that the drive does not let be lowered, one line each."""
 
 
 NO_LIMITS = OwnLimits(None, None, math.inf, math.inf)

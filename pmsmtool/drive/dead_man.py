@@ -46,30 +46,20 @@ _STOPPING = (AbortConnection.FAULT, AbortConnection.DISABLE_VOLTAGE, AbortConnec
 
 @dataclass(frozen=True, slots=True)
 class DeadManProof:
-    """What was declared and what was measured.
-
-    Attributes
-    ----------
-    declared_s : float
-        The voltage must be off within this time after the last heartbeat (s).
-    measured_s : float
-        Time it took (s).
-    abort_connection : AbortConnection or None
-        Option code 0x6007 in force; None where the drive has none: what it does was seen, not asked.
-    quick_stop : int or None
-        Option code 0x605A in force; None where the drive has none.
-    left_for : State
-        State the drive went to.
-    by : str
-        What stopped: the tool's ``heartbeat``, its ``node guarding``, or its ``process data``.
-    """
+    """What was declared and what was measured."""
 
     declared_s: float
+    """The voltage must be off within this time after the last heartbeat (s)."""
     measured_s: float
+    """Time it took (s)."""
     abort_connection: AbortConnection | None
+    """Option code 0x6007 in force; None where the drive has none: what it does was seen, not asked."""
     quick_stop: int | None
+    """Option code 0x605A in force; None where the drive has none."""
     left_for: State
+    """State the drive went to."""
     by: str = "heartbeat"
+    """What stopped: the tool's ``heartbeat``, its ``node guarding``, or its ``process data``."""
 
     def __str__(self) -> str:
         return (
@@ -80,18 +70,12 @@ class DeadManProof:
 
 @dataclass(slots=True)
 class _Late:
-    """What kept a try from measuring.
-
-    Attributes
-    ----------
-    own_s : float
-        By how much this computer woke later than it wanted to, at most (s).
-    answer_s : float
-        Longest time between a question and its answer (s).
-    """
+    """What kept a try from measuring."""
 
     own_s: float = 0.0
+    """By how much this computer woke later than it wanted to, at most (s)."""
     answer_s: float = 0.0
+    """Longest time between a question and its answer (s)."""
 
     def note(self, wanted_s: float, began_s: float, asked_s: float, answered_s: float) -> None:
         """Take a pause that should have taken a time (s), and the question behind it: began, asked, answered (s)."""

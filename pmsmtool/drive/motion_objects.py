@@ -85,21 +85,14 @@ stored, one maker's drive takes 10 s; others take no time (0), or 0.1 ms."""
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """A quantity in an object of the live drive.
-
-    Attributes
-    ----------
-    item : DriveObject
-        Where.
-    per_count : float
-        A peak, rpm or rad/s, per count.
-    undecided : bool
-        Whether no source says if a current is peak or rms.
-    """
+    """A quantity in an object of the live drive."""
 
     item: DriveObject
+    """Where."""
     per_count: float
+    """A peak, rpm or rad/s, per count."""
     undecided: bool = False
+    """Whether no source says if a current is peak or rms."""
 
     def __str__(self) -> str:
         return f"0x{self.item.index:04X}" + (f":{self.item.sub:02X}" if self.item.sub else "")

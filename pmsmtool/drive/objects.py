@@ -16,19 +16,13 @@ WHOLE_LETTERS = {1: "b", 2: "h", 4: "i", 8: "q"}
 
 @dataclass(frozen=True, slots=True)
 class DriveObject:
-    """One object with a number in it.
-
-    Attributes
-    ----------
-    index, sub : int
-        Address.
-    letter : str
-        ``struct`` letter of its CiA 301 type.
-    """
+    """One object with a number in it."""
 
     index: int
     sub: int
+    """Address."""
     letter: str
+    """``struct`` letter of its CiA 301 type."""
 
     @property
     def size(self) -> int:

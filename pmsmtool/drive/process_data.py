@@ -219,28 +219,19 @@ def _groups(names: Sequence[str], objects: Mapping[str, DriveObject]) -> list[li
 
 @dataclass(frozen=True, slots=True)
 class BorrowedPdo:
-    """What a PDO was.
-
-    Attributes
-    ----------
-    communication, mapping : int
-        Its two records.
-    cob_id : int
-        With the bits above the identifier.
-    count : int
-        Entries in force.
-    entries : tuple of int
-        What is overwritten: those in force, and as many as are needed.
-    rest : dict of int to bytes
-        Kind, inhibit time unless it is 0, and event timer by sub-index; a drive may lack the times.
-    """
+    """What a PDO was."""
 
     communication: int
     mapping: int
+    """Its two records."""
     cob_id: int
+    """With the bits above the identifier."""
     count: int
+    """Entries in force."""
     entries: tuple[int, ...]
+    """What is overwritten: those in force, and as many as are needed."""
     rest: dict[int, bytes]
+    """Kind, inhibit time unless it is 0, and event timer by sub-index; a drive may lack the times."""
 
     @property
     def has_event_timer(self) -> bool:

@@ -93,30 +93,20 @@ class AxisPulse:
 
 @dataclass(frozen=True, slots=True)
 class ScanPlan:
-    """What a scan may use.
-
-    Attributes
-    ----------
-    i_max_a : float
-        Largest current vector that the machine is to see (A peak).
-    u_max_v : float
-        Largest voltage vector (V peak).
-    held : bool
-        Whether the rotor is held; a free one gets shorter and higher pulses, and is braked before each train.
-    drop_v : float
-        Resistive drop at that current and the inverter's error (V): the pulses must be well above it.
-    rectangles : tuple
-        Shares of d and q current, one trace each.
-    i_d_max_a : float
-        Largest d current, of either sign: more may demagnetise the rotor (A peak).
-    """
+    """What a scan may use."""
 
     i_max_a: float
+    """Largest current vector that the machine is to see (A peak)."""
     u_max_v: float
+    """Largest voltage vector (V peak)."""
     held: bool
+    """Whether the rotor is held; a free one gets shorter and higher pulses, and is braked before each train."""
     drop_v: float = 0.0
+    """Resistive drop at that current and the inverter's error (V): the pulses must be well above it."""
     rectangles: tuple[tuple[float, float], ...] = RECTANGLES
+    """Shares of d and q current, one trace each."""
     i_d_max_a: float = math.inf
+    """Largest d current, of either sign: more may demagnetise the rotor (A peak)."""
 
     def reach_a(self, axis: Axis) -> float:
         """Return the largest current of an axis (A peak)."""

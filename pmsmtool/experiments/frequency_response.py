@@ -40,27 +40,18 @@ current is then no bias: with it the shaft stopped in five of six records, and J
 
 @dataclass(frozen=True, slots=True)
 class FrequencyPlan:
-    """Random torque on a speed.
-
-    Attributes
-    ----------
-    i_q_a : float
-        Level of the sequence (A peak).
-    omega_rad_s : float
-        Steady mechanical speed (rad/s).
-    hold_periods : int
-        Control periods per bit.
-    decimation : int
-        Control periods per row.
-    per_ampere_rad_s2 : float
-        Rough mechanical acceleration per q current (rad/s2/A).
-    """
+    """Random torque on a speed."""
 
     i_q_a: float
+    """Level of the sequence (A peak)."""
     omega_rad_s: float
+    """Steady mechanical speed (rad/s)."""
     hold_periods: int
+    """Control periods per bit."""
     decimation: int
+    """Control periods per row."""
     per_ampere_rad_s2: float
+    """Rough mechanical acceleration per q current (rad/s2/A)."""
 
     def bias_doubt_a(self, period_s: float) -> float:
         """Return the error of the bias that changes the speed by :data:`WALK_SHARE` within the longest record (A)."""

@@ -49,21 +49,14 @@ inverter's dead time holds a small current back."""
 
 @dataclass(frozen=True, slots=True)
 class ShaftAnswer:
-    """What a shaft does with a torque current.
-
-    Attributes
-    ----------
-    per_ampere : float
-        Mechanical acceleration per current beyond friction (rad/s2/A).
-    friction_a : float
-        Current that friction takes (A peak).
-    direction : int
-        -1 where the position falls under a positive torque current, else 1.
-    """
+    """What a shaft does with a torque current."""
 
     per_ampere: float
+    """Mechanical acceleration per current beyond friction (rad/s2/A)."""
     friction_a: float = 0.0
+    """Current that friction takes (A peak)."""
     direction: int = 1
+    """-1 where the position falls under a positive torque current, else 1."""
 
     def most_a(self, gain_rad_s: float, seconds: float) -> float:
         """Return the current (A peak) that adds at most a speed (rad/s) in a time (s), or just overcomes friction."""
@@ -176,30 +169,20 @@ integral follows the falling back-EMF lets 8 % flow on a light shaft until frict
 
 @dataclass(frozen=True, slots=True)
 class MechanicsPlan:
-    """Pushes and coasting.
-
-    Attributes
-    ----------
-    i_q_a : float
-        Current of a push (A peak).
-    unit_s : float
-        Length of the first push (s); the second is twice as long.
-    omega_rad_s : float
-        Mechanical speed they are to reach (rad/s).
-    i_most_a : float
-        Largest current of one: :attr:`i_q_a` is smaller where the shaft is so light that it reaches the speed at once.
-    rows : int
-        Largest number of rows of a push.
-    coast_units : float
-        Time of a coasting, in pushes.
-    """
+    """Pushes and coasting."""
 
     i_q_a: float
+    """Current of a push (A peak)."""
     unit_s: float
+    """Length of the first push (s); the second is twice as long."""
     omega_rad_s: float
+    """Mechanical speed they are to reach (rad/s)."""
     i_most_a: float
+    """Largest current of one (A); ``i_q_a`` is smaller for a shaft so light that it reaches the speed at once."""
     rows: int = ROWS
+    """Largest number of rows of a push."""
     coast_units: float = COAST_UNITS
+    """Time of a coasting, in pushes."""
 
     @property
     def coast_s(self) -> float:

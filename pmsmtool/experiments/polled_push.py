@@ -71,30 +71,20 @@ as one from zero, which on two shipped machines was 2.1 times the commanded curr
 
 @dataclass(frozen=True, slots=True)
 class PolledPushPlan:
-    """How the shaft is pushed.
-
-    Attributes
-    ----------
-    i_test_a : float
-        Largest torque current (A peak).
-    omega_m_rad_s : float
-        Mechanical speed the pushes go to, both ways (rad/s).
-    omega_top_rad_s : float
-        Speed no run-up goes beyond (rad/s).
-    shares : tuple of float
-        Torque currents of the pushes, of the largest.
-    omega_failure_rad_s : float
-        Speed that must not be reached although the tool fails during a push (rad/s); infinity: the drive sees to it.
-    off_s : float
-        Time until the voltage is off then (s).
-    """
+    """How the shaft is pushed."""
 
     i_test_a: float
+    """Largest torque current (A peak)."""
     omega_m_rad_s: float
+    """Mechanical speed the pushes go to, both ways (rad/s)."""
     omega_top_rad_s: float
+    """Speed no run-up goes beyond (rad/s)."""
     shares: tuple[float, ...] = (0.3, 0.5, 0.7)
+    """Torque currents of the pushes, of the largest."""
     omega_failure_rad_s: float = math.inf
+    """Speed that must not be reached although the tool fails during a push (rad/s); infinity: the drive sees to it."""
     off_s: float = 0.5
+    """Time until the voltage is off then (s)."""
 
     def stop_a(self, answer: ShaftAnswer) -> float:
         """Return the largest current (A peak) that brakes the shaft."""
@@ -252,36 +242,24 @@ def _polled(drive: Drive, i_q_a: float, seconds: float) -> Trace:
 
 @dataclass(frozen=True, slots=True)
 class PushPlan:
-    """How the shaft is swung.
-
-    Attributes
-    ----------
-    i_test_a : float
-        Largest torque current (A peak).
-    omega_m_rad_s : float
-        Mechanical speed the swing goes to, both ways (rad/s).
-    shares : tuple of float
-        Torque currents, of the largest.
-    u_max_v : float
-        Largest sinusoidal voltage (V); infinity: not known.
-    i_max_a : float
-        Largest current vector that is allowed (A peak).
-    samples : int
-        Samples of one record.
-    omega_failure_rad_s : float
-        Speed that must not be reached although the tool fails during a push (rad/s); infinity: the drive sees to it.
-    off_s : float
-        Time until the voltage is off then (s).
-    """
+    """How the shaft is swung."""
 
     i_test_a: float
+    """Largest torque current (A peak)."""
     omega_m_rad_s: float
+    """Mechanical speed the swing goes to, both ways (rad/s)."""
     shares: tuple[float, ...] = (0.2, 0.3, 0.45, 0.6, 0.8, 1.0)
+    """Torque currents, of the largest."""
     samples: int = 1024
+    """Samples of one record."""
     u_max_v: float = math.inf
+    """Largest sinusoidal voltage (V); infinity: not known."""
     i_max_a: float = math.inf
+    """Largest current vector that is allowed (A peak)."""
     omega_failure_rad_s: float = math.inf
+    """Speed that must not be reached although the tool fails during a push (rad/s); infinity: the drive sees to it."""
     off_s: float = 0.5
+    """Time until the voltage is off then (s)."""
 
 
 def swing(

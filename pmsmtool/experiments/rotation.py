@@ -192,27 +192,18 @@ BACK_LEAST_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class RotationPlan:
-    """How the vector is turned.
-
-    Attributes
-    ----------
-    i_a : float
-        Length of the vector (A peak).
-    step_rad : float
-        Electrical angle of one step.
-    dwell_s : float
-        Time per step (s).
-    turns_mechanical : float
-        Mechanical turns in each direction.
-    ramp_s : float
-        Time in which the vector comes to its speed, and to rest again (s).
-    """
+    """How the vector is turned."""
 
     i_a: float
+    """Length of the vector (A peak)."""
     step_rad: float = STEP_RAD
+    """Electrical angle of one step."""
     dwell_s: float = 0.015
+    """Time per step (s)."""
     turns_mechanical: float = 1.02
+    """Mechanical turns in each direction."""
     ramp_s: float = RAMP_S
+    """Time in which the vector comes to its speed, and to rest again (s)."""
 
     @property
     def ramp(self) -> tuple[float, ...]:

@@ -64,48 +64,34 @@ REACH_LIMIT_S = 8.0
 
 @dataclass(frozen=True, slots=True)
 class SpeedPlan:
-    """Speeds to reach, and currents to hold there.
-
-    Attributes
-    ----------
-    omega_max_rad_s : float
-        Largest mechanical speed (rad/s).
-    i_d_a : float
-        Largest d current, held with both signs (A peak).
-    i_q_a : float
-        q current, held with both signs (A peak).
-    settle_s : float
-        Time between a current's command and its window (s).
-    first_s : float
-        The same after the speed controller (s).
-    window_s, longest_s : float
-        Shortest window, rounded up to whole mechanical turns; where one turn is longer than the longest, whole
-        electrical turns must do (s).
-    q_window_s : float
-        Shortest window of a q current, which accelerates the shaft: whole electrical turns (s).
-    per_ampere_rad_s2, acceleration_rad_s2 : float
-        Rough mechanical acceleration per q current (rad/s2/A), and the one of the speed controller (rad/s2).
-    shares, d_shares, q_at : tuple
-        As :data:`SHARES`, :data:`D_SHARES` and :data:`Q_AT`.
-    quick : bool
-        Whether a shaft that coasts well enough at its first speed is left to coast at the others as soon as it is seen
-        there, without a look at what would hold it.
-    """
+    """Speeds to reach, and currents to hold there."""
 
     omega_max_rad_s: float
+    """Largest mechanical speed (rad/s)."""
     i_d_a: float
+    """Largest d current, held with both signs (A peak)."""
     i_q_a: float
+    """q current, held with both signs (A peak)."""
     settle_s: float = SETTLE_S
+    """Time between a current's command and its window (s)."""
     first_s: float = 0.05
+    """The same after the speed controller (s)."""
     window_s: float = WINDOW_S
     longest_s: float = 0.2
+    """Shortest window, rounded up to whole mechanical turns; where one turn is longer than the longest, whole
+    electrical turns must do (s)."""
     q_window_s: float = Q_WINDOW_S
+    """Shortest window of a q current, which accelerates the shaft: whole electrical turns (s)."""
     per_ampere_rad_s2: float = 0.0
     acceleration_rad_s2: float = math.inf
+    """Rough mechanical acceleration per q current (rad/s2/A), and the one of the speed controller (rad/s2)."""
     shares: tuple[float, ...] = SHARES
     d_shares: tuple[tuple[float, ...], ...] = D_SHARES
     q_at: tuple[int, ...] = Q_AT
+    """As :data:`SHARES`, :data:`D_SHARES` and :data:`Q_AT`."""
     quick: bool = False
+    """Whether a shaft that coasts well enough at its first speed is left to coast at the others as soon as it is seen
+    there, without a look at what would hold it."""
 
     @property
     def slowest(self) -> float:
@@ -131,19 +117,13 @@ class SpeedPlan:
 
 @dataclass(frozen=True, slots=True)
 class SteadyLoop:
-    """Current loop of the run.
-
-    Attributes
-    ----------
-    K_p_v_per_a, K_i_v_per_as : tuple of float
-        Gains of the d and the q axis.
-    settle_s : float
-        Time from a change of sign of i_d to steady currents (s).
-    """
+    """Current loop of the run."""
 
     K_p_v_per_a: tuple[float, float]
     K_i_v_per_as: tuple[float, float]
+    """Gains of the d and the q axis."""
     settle_s: float
+    """Time from a change of sign of i_d to steady currents (s)."""
 
 
 def steady_loop(

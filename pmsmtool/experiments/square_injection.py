@@ -43,36 +43,24 @@ ENOUGH = 0.2
 
 @dataclass(frozen=True, slots=True)
 class SquarePlan:
-    """A square wave on a bias.
-
-    Attributes
-    ----------
-    bias_d_a : float
-        Current along the frame's d axis (A peak).
-    half_periods : tuple of int
-        Half periods (control periods), one record each, of about the same ripple from the second on.
-    samples : int
-        Length of a record.
-    ripple_a : float
-        Wanted ripple, peak to peak (A).
-    u_max_v : float
-        Largest amplitude (V).
-    bias_bandwidth_rad_s : float
-        Bandwidth of the loop that holds the bias; far below the injection.
-    lead_s : float
-        How long the injection runs before the record: its first half wave pushes the rotor and the bias (s).
-    angle_rad : float
-        Electrical angle of the frozen frame.
-    """
+    """A square wave on a bias."""
 
     bias_d_a: float
+    """Current along the frame's d axis (A peak)."""
     ripple_a: float
+    """Wanted ripple, peak to peak (A)."""
     u_max_v: float
+    """Largest amplitude (V)."""
     half_periods: tuple[int, ...] = (6, 9)
+    """Half periods (control periods), one record each, of about the same ripple from the second on."""
     samples: int = SHOT_SAMPLES
+    """Length of a record."""
     bias_bandwidth_rad_s: float = BIAS_BANDWIDTH_RAD_S
+    """Bandwidth of the loop that holds the bias; far below the injection."""
     lead_s: float = 0.1
+    """How long the injection runs before the record: its first half wave pushes the rotor and the bias (s)."""
     angle_rad: float = 0.0
+    """Electrical angle of the frozen frame."""
 
 
 def hold_bias(drive: Drive, plan: SquarePlan) -> None:

@@ -107,41 +107,28 @@ NEAR_SHARE = 0.002
 
 @dataclass(frozen=True, slots=True)
 class LevelPlan:
-    """DC levels along one vector.
-
-    Attributes
-    ----------
-    levels_a : sequence of float
-        Signed currents in the order they are held (A peak).
-    turn_a : float
-        Current that turns the rotor to the vector before the first level and at every change of sign (A peak).
-    start_rad : float
-        Electrical angle of the vector that was held last: the rotor is near it.
-    settle_s : float
-        Time between the set-point and the window (s).
-    window_periods : int
-        Control periods averaged per level, about, split into two halves: each a whole multiple of ``RIPPLE_S``.
-    angle_rad : float
-        Electrical angle of the vector in the stator frame.
-    drift : float
-        Change of the voltage between the halves of a window, relative, that asks for another window.
-    turn_s : float or None
-        Time of a turn of the vector, of the waits alone (s); None: as long as the rotor swings.
-    quick : bool
-        Whether every change of sign turns the vector on instead of back, so that the rests show the pole pairs; a rotor
-        that stands where it stood before the current changed is at rest then without a second look, and a swing braked;
-        and windows are as short as asked where the link is steady.
-    """
+    """DC levels along one vector."""
 
     levels_a: Sequence[float]
+    """Signed currents in the order they are held (A peak)."""
     turn_a: float
+    """Current that turns the rotor to the vector before the first level and at every change of sign (A peak)."""
     start_rad: float = 0.0
+    """Electrical angle of the vector that was held last: the rotor is near it."""
     settle_s: float = 0.06
+    """Time between the set-point and the window (s)."""
     window_periods: int = LEVEL_WINDOW
+    """Control periods averaged per level, about, split into two halves: each a whole multiple of ``RIPPLE_S``."""
     angle_rad: float = DC_ANGLE_RAD
+    """Electrical angle of the vector in the stator frame."""
     drift: float = DRIFTED
+    """Change of the voltage between the halves of a window, relative, that asks for another window."""
     turn_s: float | None = TURN_S
+    """Time of a turn of the vector, of the waits alone (s); None: as long as the rotor swings."""
     quick: bool = False
+    """Whether every change of sign turns the vector on instead of back, so that the rests show the pole pairs; a rotor
+    that stands where it stood before the current changed is at rest then without a second look, and a swing braked;
+    and windows are as short as asked where the link is steady."""
 
 
 def half_window(window_periods: int, period_s: float) -> int:

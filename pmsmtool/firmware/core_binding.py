@@ -23,18 +23,12 @@ CORE_HEADERS = ("pmsm_types.h", "pmsm_params.h", "pmsm_core.h", "pmsm_projection
 
 @dataclass(frozen=True, slots=True)
 class CoreBinding:
-    """A loaded core and its types.
-
-    Attributes
-    ----------
-    library : ctypes.CDLL
-        ``pmsm_core`` (float) or ``pmsm_core_f64`` (double), with argument types set.
-    types : mapping of str to ctypes type
-        ``pmsm_params``, ``pmsm_state``, ``pmsm_measurement``, ``pmsm_reference``, ``pmsm_output``, ...
-    """
+    """A loaded core and its types."""
 
     library: ctypes.CDLL
+    """``pmsm_core`` (float) or ``pmsm_core_f64`` (double), with argument types set."""
     types: Mapping[str, CType]
+    """``pmsm_params``, ``pmsm_state``, ``pmsm_measurement``, ``pmsm_reference``, ``pmsm_output``, ..."""
 
     def make(self, name: str, **members: Any) -> Any:
         """Return a new structure, zero but for the members given."""

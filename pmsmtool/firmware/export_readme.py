@@ -15,21 +15,15 @@ from pmsmtool.native import parse_structs
 
 
 class Cost(NamedTuple):
-    """What a whole period of a law takes on a Cortex-M4F.
-
-    Attributes
-    ----------
-    mean, nominal, worst : int
-        Model cycles: mean and worst of a nominal run, worst of the adversarial search; rows of
-        ``benchmarks/core_cost.md``.
-    stack : int
-        Bytes of stack, as ``python benchmarks/core_cost.py --stack`` found them (clang, -O2).
-    """
+    """What a whole period of a law takes on a Cortex-M4F."""
 
     mean: int
     nominal: int
     worst: int
+    """Model cycles: mean and worst of a nominal run, worst of the adversarial search; rows of
+    ``benchmarks/core_cost.md``."""
     stack: int
+    """Bytes of stack, as ``python benchmarks/core_cost.py --stack`` found them (clang, -O2)."""
 
 
 COSTS = {

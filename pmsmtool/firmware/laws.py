@@ -11,27 +11,18 @@ from pmsmtool.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """A control law that can be left out.
-
-    Attributes
-    ----------
-    name : str
-        What people call it.
-    macro : str
-        Its switch in ``pmsm_laws.h``.
-    mode : str
-        Parameter that chooses it.
-    last_without : int
-        Largest value of ``mode`` that does not need it.
-    sources : tuple of str
-        Files of ``firmware/core`` that only this law needs, and those it shares with others.
-    """
+    """A control law that can be left out."""
 
     name: str
+    """What people call it."""
     macro: str
+    """Its switch in ``pmsm_laws.h``."""
     mode: str
+    """Parameter that chooses it."""
     last_without: int
+    """Largest value of ``mode`` that does not need it."""
     sources: tuple[str, ...]
+    """Files of ``firmware/core`` that only this law needs, and those it shares with others."""
 
     @property
     def room(self) -> str:

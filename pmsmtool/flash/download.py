@@ -58,31 +58,21 @@ class Phase(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a download did.
-
-    Attributes
-    ----------
-    written, equal : int
-        Objects written, objects that held their value already.
-    stored : bool or None
-        Whether the drive keeps the set over a reset, as seen after one; None where nothing shows it.
-    crc : int or None
-        CRC-32 of the drive's whole set; None where it has none.
-    retries : int
-        Transfers repeated.
-    starts : int
-        2 when the node was reset in between and everything started over.
-    refused : mapping of str to str
-        Objects the drive did not take or keep, and why; only where objects go by their addresses.
-    """
+    """What a download did."""
 
     written: int
     equal: int
+    """Objects written, objects that held their value already."""
     stored: bool | None
+    """Whether the drive keeps the set over a reset, as seen after one; None where nothing shows it."""
     crc: int | None
+    """CRC-32 of the drive's whole set; None where it has none."""
     retries: int
+    """Transfers repeated."""
     starts: int
+    """2 when the node was reset in between and everything started over."""
     refused: Mapping[str, str] = field(default_factory=dict)
+    """Objects the drive did not take or keep, and why; only where objects go by their addresses."""
 
     @property
     def kept(self) -> str:

@@ -41,59 +41,39 @@ class DamagedSnapshot(ConfigError):
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One object of a snapshot.
-
-    Attributes
-    ----------
-    name : str
-        Catalogue or table name; ``design_id``, ``configuration_date``, ``configuration_time`` for the marks.
-    index, sub : int
-        The object.
-    old : bytes
-        What the drive held.
-    new : bytes or None
-        What a download was to write; None in a backup.
-    """
+    """One object of a snapshot."""
 
     name: str
+    """Catalogue or table name; ``design_id``, ``configuration_date``, ``configuration_time`` for the marks."""
     index: int
     sub: int
+    """The object."""
     old: bytes
+    """What the drive held."""
     new: bytes | None = None
+    """What a download was to write; None in a backup."""
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """What a drive held, and what it was to hold.
-
-    Attributes
-    ----------
-    kind : str
-        ``journal`` of a download or ``backup``.
-    state : str
-        ``open`` until the drive is known to hold the new or the old set again.
-    identity : Identity
-        Of the drive.
-    signature : int
-        Layout signature of its parameter set, 0 where it has none.
-    content : str
-        Content hash of the set that was written; empty in a backup.
-    entries : tuple of Entry
-        Parameters in writing order, then the marks.
-    stored : bool
-        Whether that download stored what it wrote, or brought back, and saw it after a reset.
-    current_limit_apk : float or None
-        Smallest limit of the current that the drive held (A peak); None where none of known unit was seen.
-    """
+    """What a drive held, and what it was to hold."""
 
     kind: Kind
+    """``journal`` of a download or ``backup``."""
     state: State
+    """``open`` until the drive is known to hold the new or the old set again."""
     identity: Identity
+    """Of the drive."""
     signature: int
+    """Layout signature of its parameter set, 0 where it has none."""
     content: str
+    """Content hash of the set that was written; empty in a backup."""
     entries: tuple[Entry, ...]
+    """Parameters in writing order, then the marks."""
     current_limit_apk: float | None = None
+    """Smallest limit of the current that the drive held (A peak); None where none of known unit was seen."""
     stored: bool = False
+    """Whether that download stored what it wrote, or brought back, and saw it after a reset."""
 
     def shows_stored(self, held: Mapping[tuple[int, int], bytes]) -> bool | None:
         """Return whether a drive keeps over a reset what it holds, by its last journal; None: that does not show it.

@@ -27,32 +27,23 @@ difference of a data sheet to the machine that was measured."""
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One object of a plan.
-
-    Attributes
-    ----------
-    name : str
-        Catalogue or table name.
-    index, sub : int
-        The object.
-    old, new : bytes
-        Contents before and after; equal bytes are not written.
-    old_value, wanted, held : float
-        Value on the drive, value asked for, value the drive will hold (SI); NaN for tables, and where nobody says what
-        the drive's own scale is.
-    unit : str
-        Of the values.
-    """
+    """One object of a plan."""
 
     name: str
+    """Catalogue or table name."""
     index: int
     sub: int
+    """The object."""
     old: bytes
     new: bytes
+    """Contents before and after; equal bytes are not written."""
     old_value: float = math.nan
     wanted: float = math.nan
     held: float = math.nan
+    """Value on the drive, value asked for, value the drive will hold (SI); NaN for tables, and where nobody says what
+    the drive's own scale is."""
     unit: str = ""
+    """Of the values."""
 
     @property
     def changes(self) -> bool:
@@ -77,27 +68,18 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """All objects of a set, those that already hold their value included.
-
-    Attributes
-    ----------
-    entries : tuple of Change
-        In writing order.
-    not_written : mapping of str to str
-        Entries of the set that the drive's map has no object for, and why.
-    content : str
-        Content hash of the set.
-    reasons : mapping of str to str
-        What the drive's map leaves out by name: these entries are told one by one.
-    kept : tuple of str
-        Entries whose object is there and stays as it is.
-    """
+    """All objects of a set, those that already hold their value included."""
 
     entries: tuple[Change, ...]
+    """In writing order."""
     not_written: Mapping[str, str] = field(default_factory=dict)
+    """Entries of the set that the drive's map has no object for, and why."""
     content: str = ""
+    """Content hash of the set."""
     reasons: Mapping[str, str] = field(default_factory=dict)
+    """What the drive's map leaves out by name: these entries are told one by one."""
     kept: tuple[str, ...] = ()
+    """Entries whose object is there and stays as it is."""
 
     @property
     def missing(self) -> tuple[str, ...]:

@@ -73,27 +73,18 @@ _CONFUSION_WIDTH = 0.02
 
 @dataclass(frozen=True, slots=True)
 class EmfConstant:
-    """Back-EMF constant as printed.
-
-    Attributes
-    ----------
-    value : float
-        V s per mechanical rad, or Wb (V s per electrical rad) if ``is_flux``.
-    kind : {"rms", "peak", "block"}
-        What the voltage is; a flux linkage is peak.
-    between : {"line-line", "phase"}
-        Where it is measured; "phase" of a delta is its winding.
-    is_flux : bool
-        Already a flux linkage of the star phase.
-    text : str
-        As printed.
-    """
+    """Back-EMF constant as printed."""
 
     value: float
+    """V s per mechanical rad, or Wb (V s per electrical rad) if ``is_flux``."""
     kind: CommutatedKind
+    """What the voltage is; a flux linkage is peak. One of "rms", "peak", "block"."""
     between: Between
+    """Where it is measured; "phase" of a delta is its winding. One of "line-line", "phase"."""
     is_flux: bool
+    """Already a flux linkage of the star phase."""
     text: str
+    """As printed."""
 
 
 @dataclass(frozen=True, slots=True)

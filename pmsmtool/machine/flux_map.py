@@ -71,28 +71,20 @@ class FluxMap:
     """Flux linkages over a grid of currents (amplitude-invariant, rotor frame, d axis along the magnets).
 
     Raises ConfigError: shapes that do not fit, an axis that does not increase, too few nodes, or holes.
-
-    Attributes
-    ----------
-    i_d_a, i_q_a : ndarray, shape (n_d,), (n_q,)
-        Increasing axes (A peak).
-    psi_d_wb, psi_q_wb : ndarray, shape (n_d, n_q)
-        Flux linkages (Wb peak), finite.
-    kind : {"bicubic", "bilinear"}
-        Interpolation of both tables.
-    inverse_nodes : tuple of int
-        Nodes of the inverse table along psi_d and psi_q.
-    meta : mapping
-        JSON-serialisable facts: origin, what was repaired.
     """
 
     i_d_a: Array
     i_q_a: Array
+    """Increasing axes (A peak). Shape (n_d,), (n_q,)."""
     psi_d_wb: Array
     psi_q_wb: Array
+    """Flux linkages (Wb peak), finite. Shape (n_d, n_q)."""
     kind: Kind = "bicubic"
+    """Interpolation of both tables. One of "bicubic", "bilinear"."""
     inverse_nodes: tuple[int, int] = INVERSE_NODES
+    """Nodes of the inverse table along psi_d and psi_q."""
     meta: Mapping[str, Any] = field(default_factory=dict)
+    """JSON-serialisable facts: origin, what was repaired."""
 
     def __post_init__(self) -> None:
         violations = _violations(self)
@@ -181,24 +173,16 @@ class FluxMap:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class FluxTables:
-    """The built tables of a map.
-
-    Attributes
-    ----------
-    inverse : Table
-        i(psi).
-    struct : FluxMapStruct
-        psi(i) and i(psi) for C.
-    inverse_error_a : float
-        Largest |i(psi(i)) - i| (A) over the nodes and the cell centres of the map.
-    inverse_error_rms_a : float
-        Its root mean square (A).
-    """
+    """The built tables of a map."""
 
     inverse: Table
+    """i(psi)."""
     struct: FluxMapStruct
+    """psi(i) and i(psi) for C."""
     inverse_error_a: float
+    """Largest |i(psi(i)) - i| (A) over the nodes and the cell centres of the map."""
     inverse_error_rms_a: float
+    """Its root mean square (A)."""
 
 
 def _violations(flux_map: FluxMap) -> list[str]:
@@ -345,41 +329,27 @@ _AXIS = np.array([-1.0, 1.0])
 
 @dataclass(frozen=True, slots=True)
 class FluxScale:
-    """Factors over the nominal machine.
-
-    Attributes
-    ----------
-    L_d, L_q : float
-        Of what the currents add to the flux along each axis.
-    psi_f : float
-        Of the magnet's flux.
-    """
+    """Factors over the nominal machine."""
 
     L_d: float = 1.0
     L_q: float = 1.0
+    """Of what the currents add to the flux along each axis."""
     psi_f: float = 1.0
+    """Of the magnet's flux."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScalableMap:
-    """A map prepared for many machines.
-
-    Attributes
-    ----------
-    base : FluxMapStruct
-        Both tables of the nominal machine.
-    psi_f_wb : float
-        Magnet flux (Wb) that ``FluxScale.psi_f`` applies to.
-    psi_zero_wb : tuple of float
-        Fluxes without current (Wb).
-    L_least_h : float
-        Smallest differential inductance over the nodes (H).
-    """
+    """A map prepared for many machines."""
 
     base: FluxMapStruct
+    """Both tables of the nominal machine."""
     psi_f_wb: float
+    """Magnet flux (Wb) that ``FluxScale.psi_f`` applies to."""
     psi_zero_wb: tuple[float, float]
+    """Fluxes without current (Wb)."""
     L_least_h: float
+    """Smallest differential inductance over the nodes (H)."""
 
     @classmethod
     def of(cls, flux_map: FluxMap, psi_f_wb: float) -> ScalableMap:

@@ -75,38 +75,26 @@ def per_step(axis: Array) -> float:
 
 
 class Evaluation(NamedTuple):
-    """What a table gives at points of any shape ``s``.
-
-    Attributes
-    ----------
-    value : ndarray, shape (2, *s)
-        The two quantities.
-    jacobian : ndarray, shape (2, 2, *s)
-        ``jacobian[k, m]`` is the derivative of quantity k by argument m.
-    outside : ndarray of bool, shape (2, *s)
-        Whether argument m lies outside its axis (the value is the continuation).
-    """
+    """What a table gives at points of any shape ``s``."""
 
     value: Array
+    """The two quantities. Shape (2, *s)."""
     jacobian: Array
+    """``jacobian[k, m]`` is the derivative of quantity k by argument m. Shape (2, 2, *s)."""
     outside: NDArray[np.bool_]
+    """Whether argument m lies outside its axis (the value is the continuation). Shape (2, *s)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """A table of two quantities over two axes, as cells.
-
-    Attributes
-    ----------
-    axis_1, axis_2 : ndarray, shape (n_1,), (n_2,)
-        Increasing nodes.
-    cells : ndarray, shape (n_1 - 1, n_2 - 1, 4, 4, 2)
-        ``cells[m, n, b, a, k]``: coefficient of x^a y^b of quantity k in cell (m, n).
-    """
+    """A table of two quantities over two axes, as cells."""
 
     axis_1: Array
     axis_2: Array
+    """Increasing nodes. Shape (n_1,), (n_2,)."""
     cells: Array
+    """``cells[m, n, b, a, k]``: coefficient of x^a y^b of quantity k in cell (m, n).
+    Shape (n_1 - 1, n_2 - 1, 4, 4, 2)."""
 
     @classmethod
     def fit(cls, kind: Kind, axis_1: ArrayLike, axis_2: ArrayLike, values: tuple[ArrayLike, ArrayLike]) -> Table:

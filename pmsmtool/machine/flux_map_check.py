@@ -33,59 +33,39 @@ ASYMMETRY_LIMIT = 0.005
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One number of a report.
-
-    Attributes
-    ----------
-    name : str
-        What was looked at.
-    ok : bool
-        Whether it is inside its limit.
-    text : str
-        The number, its place and its limit, one sentence.
-    """
+    """One number of a report."""
 
     name: str
+    """What was looked at."""
     ok: bool
+    """Whether it is inside its limit."""
     text: str
+    """The number, its place and its limit, one sentence."""
 
 
 @dataclass(frozen=True, slots=True)
 class FluxMapReport:
-    """What was found in a map.
-
-    Attributes
-    ----------
-    det_min_h2 : float
-        Smallest determinant of the incremental inductance (H^2); must be positive.
-    L_qq_h : tuple of float
-        Smallest and largest q self inductance of the map (H).
-    not_monotonic : int
-        Sample points (3 x 3 per cell) where the map does not rise with the current.
-    reciprocity_rms : float
-        Root mean square distance to the nearest reciprocal map, of the flux range.
-    curl_max_h : float
-        Largest cell mean of d psi_d/d i_q - d psi_q/d i_d (H).
-    no_load_angle_rad : float
-        Angle of the flux at zero current against the d axis; NaN without magnet flux.
-    psi_f_wb : float
-        Its magnitude (Wb).
-    asymmetry_rms, asymmetry_max : float
-        Deviation from psi_d even, psi_q odd in i_q, of the flux range; NaN where one side is missing.
-    findings : tuple of Finding
-        The verdicts, worst first.
-    """
+    """What was found in a map."""
 
     det_min_h2: float
+    """Smallest determinant of the incremental inductance (H^2); must be positive."""
     L_qq_h: tuple[float, float]
+    """Smallest and largest q self inductance of the map (H)."""
     not_monotonic: int
+    """Sample points (3 x 3 per cell) where the map does not rise with the current."""
     reciprocity_rms: float
+    """Root mean square distance to the nearest reciprocal map, of the flux range."""
     curl_max_h: float
+    """Largest cell mean of d psi_d/d i_q - d psi_q/d i_d (H)."""
     no_load_angle_rad: float
+    """Angle of the flux at zero current against the d axis; NaN without magnet flux."""
     psi_f_wb: float
+    """Its magnitude (Wb)."""
     asymmetry_rms: float
     asymmetry_max: float
+    """Deviation from psi_d even, psi_q odd in i_q, of the flux range; NaN where one side is missing."""
     findings: tuple[Finding, ...]
+    """The verdicts, worst first."""
 
     @property
     def ok(self) -> bool:

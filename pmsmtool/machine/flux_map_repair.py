@@ -21,20 +21,14 @@ from pmsmtool.machine.flux_map_check import flux_range, reciprocal_change
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FluxGrid:
-    """Grids as read, before they are a map: holes are NaN.
-
-    Attributes
-    ----------
-    i_d_a, i_q_a : ndarray, shape (n_d,), (n_q,)
-        Axes (A peak).
-    psi_d_wb, psi_q_wb : ndarray, shape (n_d, n_q)
-        Flux linkages (Wb).
-    """
+    """Grids as read, before they are a map: holes are NaN."""
 
     i_d_a: Array
     i_q_a: Array
+    """Axes (A peak). Shape (n_d,), (n_q,)."""
     psi_d_wb: Array
     psi_q_wb: Array
+    """Flux linkages (Wb). Shape (n_d, n_q)."""
 
     @property
     def holes(self) -> NDArray[np.bool_]:

@@ -19,44 +19,30 @@ KeyKind = Literal["float", "int", "bool", "text", "floats"]
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """One key of a table.
-
-    Attributes
-    ----------
-    table, name : str
-        Where it stands; the unit is the suffix of the name.
-    kind : KeyKind
-        Type of its value; ``floats`` is an array.
-    unit : str
-        Unit, as in ``units.UNITS``; empty for text and booleans.
-    minimum, maximum : float
-        Inclusive bounds.
-    default : Value or None
-        What holds without the key; None where there is no value without it.
-    meaning : str
-        One line.
-    required : bool
-        Whether a file must give it.
-    choices : tuple of str
-        Allowed texts; empty for free text.
-    falls_back : str
-        Key in another table that holds without this one, ``[table] key``.
-    besides : tuple of float
-        Numbers allowed outside the bounds, among them infinity and NaN: zero for "none", infinity for "no limit".
-    """
+    """One key of a table."""
 
     table: str
     name: str
+    """Where it stands; the unit is the suffix of the name."""
     kind: KeyKind
+    """Type of its value; ``floats`` is an array."""
     unit: str
+    """Unit, as in ``units.UNITS``; empty for text and booleans."""
     minimum: float
     maximum: float
+    """Inclusive bounds."""
     default: Value | None
+    """What holds without the key; None where there is no value without it."""
     meaning: str
+    """One line."""
     required: bool = False
+    """Whether a file must give it."""
     choices: tuple[str, ...] = ()
+    """Allowed texts; empty for free text."""
     falls_back: str = ""
+    """Key in another table that holds without this one, ``[table] key``."""
     besides: tuple[float, ...] = ()
+    """Numbers allowed outside the bounds, among them infinity and NaN: zero for "none", infinity for "no limit"."""
 
     def check(self, value: Any) -> tuple[Value | None, str]:
         """Return the value as its type and an empty text, or None and what is wrong with it."""

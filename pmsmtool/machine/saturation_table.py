@@ -29,22 +29,15 @@ FORWARD_SHARE = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SaturationTable:
-    """Nodes over an equidistant grid of currents.
-
-    Attributes
-    ----------
-    i_d_a, i_q_a : ndarray, shape (n_d,), (n_q,)
-        Axes (A peak); i_q begins at 0.
-    nodes : ndarray, shape (n_d, n_q, 4)
-        psi_d (Wb), psi_q/i_q, dpsi_d/di_d, dpsi_q/di_q (H).
-    flux_error_wb : float
-        Largest distance of its flux from the map's, at currents up to I_max on the table.
-    """
+    """Nodes over an equidistant grid of currents."""
 
     i_d_a: Array
     i_q_a: Array
+    """Axes (A peak); i_q begins at 0. Shape (n_d,), (n_q,)."""
     nodes: Array
+    """psi_d (Wb), psi_q/i_q, dpsi_d/di_d, dpsi_q/di_q (H). Shape (n_d, n_q, 4)."""
     flux_error_wb: float
+    """Largest distance of its flux from the map's, at currents up to I_max on the table."""
 
     def descriptor(self) -> dict[str, float]:
         """Return what a parameter set says of it: counts, and ends of the axes (A)."""

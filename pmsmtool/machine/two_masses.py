@@ -65,25 +65,17 @@ CERTAIN_ZETA = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Mechanics:
-    """Inertia and elasticity, seen from the motor.
-
-    Attributes
-    ----------
-    J : float
-        Inertia of all that turns (kg m2).
-    B : float
-        Viscous friction at the motor (N m s).
-    antiresonance_hz, resonance_hz : float
-        Of the load behind an elastic shaft (Hz); both 0: rigid.
-    zeta : float
-        Damping of the resonance.
-    """
+    """Inertia and elasticity, seen from the motor."""
 
     J: float
+    """Inertia of all that turns (kg m2)."""
     B: float = 0.0
+    """Viscous friction at the motor (N m s)."""
     antiresonance_hz: float = 0.0
     resonance_hz: float = 0.0
+    """Of the load behind an elastic shaft (Hz); both 0: rigid."""
     zeta: float = DAMPING
+    """Damping of the resonance."""
 
     @property
     def elastic(self) -> bool:

@@ -50,27 +50,18 @@ def _cold(machine: MachineParameters) -> float:
 
 @dataclass(frozen=True, slots=True)
 class FaultReaction:
-    """What a fault does to the inverter.
-
-    Attributes
-    ----------
-    generation_rpm : float
-        Speed of uncontrolled generation (rpm).
-    short_from_rpm : float
-        Speed (rpm) above which a fault shorts the windings; 0: it removes the gates at every speed.
-    trip_most_rpm : float
-        Largest over-speed trip (rpm) at which this reaction keeps the link below its limit; infinity: any.
-    how : str
-        Why.
-    note : str
-        What a person must see to; empty when there is nothing.
-    """
+    """What a fault does to the inverter."""
 
     generation_rpm: float
+    """Speed of uncontrolled generation (rpm)."""
     short_from_rpm: float
+    """Speed (rpm) above which a fault shorts the windings; 0: it removes the gates at every speed."""
     trip_most_rpm: float
+    """Largest over-speed trip (rpm) at which this reaction keeps the link below its limit; infinity: any."""
     how: str
+    """Why."""
     note: str
+    """What a person must see to; empty when there is nothing."""
 
     @property
     def n_most_rpm(self) -> float:

@@ -37,24 +37,16 @@ DATA_SHEET = (0x1021, 0)
 
 @dataclass(frozen=True, slots=True)
 class Clone:
-    """A simulated drive and what to load into it.
-
-    Attributes
-    ----------
-    machine_file : MachineFile
-        With ``[simulation]``; ``--sim FILE``.
-    parameters : ParameterSet
-        What the real drive holds, as far as its map goes.
-    data_sheet : bytes
-        Its stored EDS, empty where it has none.
-    family : str
-        Its family; the clone shows that dictionary with ``?drive=``.
-    """
+    """A simulated drive and what to load into it."""
 
     machine_file: MachineFile
+    """With ``[simulation]``; ``--sim FILE``."""
     parameters: ParameterSet
+    """What the real drive holds, as far as its map goes."""
     data_sheet: bytes
+    """Its stored EDS, empty where it has none."""
     family: str
+    """Its family; the clone shows that dictionary with ``?drive=``."""
 
 
 def clone_drive(node: DriveNode, found: Capabilities, machine_file: MachineFile, draw: int | None = None) -> Clone:

@@ -26,23 +26,16 @@ LOWEST_LEVEL = 0.08
 
 @dataclass(frozen=True, slots=True)
 class LevelEffort:
-    """DC levels and how they are held.
-
-    Attributes
-    ----------
-    shares : tuple of float or None
-        Of the largest; None: :data:`LEVELS` of them.
-    low : tuple of float
-        Those for the inverter curve alone: a speed run at small current lives there.
-    window, drift, settle_s
-        As ``standstill.LevelPlan``.
-    """
+    """DC levels and how they are held."""
 
     shares: tuple[float, ...] | None = None
+    """Of the largest; None: :data:`LEVELS` of them."""
     low: tuple[float, ...] = (0.02, 0.04)
+    """Those for the inverter curve alone: a speed run at small current lives there."""
     window: int = standstill.LEVEL_WINDOW
     drift: float = standstill.DRIFTED
     settle_s: float = 0.06
+    """As ``standstill.LevelPlan``."""
 
     def magnitudes(self, largest_a: float) -> list[float]:
         """Return the currents that are held with both signs (A), rising."""

@@ -46,27 +46,18 @@ RESTORED = "nothing is stored in the drive; every changed object is restored"
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """How a method identifies; what a drive must have for it is in ``capabilities.WAYS``.
-
-    Attributes
-    ----------
-    opens : callable
-        The kind of drive that its experiments take.
-    plan : callable
-        Returns the envelope and what a person reads before consenting, or refuses.
-    measure : callable
-        Runs the experiments; returns what the evaluation needs besides the stored traces.
-    evaluate : callable
-        Evaluates what is stored in the run, and writes the machine file.
-    begun : object
-        What to evaluate with where the experiments end early; None: nothing is.
-    """
+    """How a method identifies; what a drive must have for it is in ``capabilities.WAYS``."""
 
     opens: Callable[[Capabilities], type[CanopenDrive]]
+    """The kind of drive that its experiments take."""
     plan: Callable[[Task], tuple[Envelope, list[str]]]
+    """Returns the envelope and what a person reads before consenting, or refuses."""
     measure: Callable[[Task, Envelope, Keep, Say], Any]
+    """Runs the experiments; returns what the evaluation needs besides the stored traces."""
     evaluate: Callable[[Task, Any], Stage]
+    """Evaluates what is stored in the run, and writes the machine file."""
     begun: Any = None
+    """What to evaluate with where the experiments end early; None: nothing is."""
 
 
 METHODS: Mapping[Method, Row] = {

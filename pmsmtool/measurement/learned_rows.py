@@ -40,31 +40,22 @@ FORMS: tuple[str, ...] = get_args(Form)
 
 @dataclass(frozen=True, slots=True)
 class MeasuredRow:
-    """One gain as it was measured.
-
-    Attributes
-    ----------
-    name : str
-        Catalogue name.
-    index, sub, wire : int, int, str
-        The object.
-    form, gain : str
-        As of a row of the map.
-    scale, unit : float, str
-        One count.
-    half_width : float
-        Of the scale, relative, 95 %.
-    """
+    """One gain as it was measured."""
 
     name: str
+    """Catalogue name."""
     index: int
     sub: int
     wire: str
+    """The object."""
     form: str
     gain: str
+    """As of a row of the map."""
     scale: float
     unit: str
+    """One count."""
     half_width: float
+    """Of the scale, relative, 95 %."""
 
     def cell(self) -> Cell:
         """Return the row of a map."""

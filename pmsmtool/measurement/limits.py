@@ -29,30 +29,20 @@ Known = tuple[MachineFile, str]
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One identification.
-
-    Attributes
-    ----------
-    run : RunDirectory
-        Where everything goes.
-    drive : CanopenDrive
-        Opened as the method needs it.
-    found : Capabilities
-        What the drive has.
-    request : IdentifyRequest
-        What is asked.
-    known : MachineFile and its source, or None
-        What completes the measured values.
-    read_supply : callable or None
-        Reads the bench supply where R is asked for so.
-    """
+    """One identification."""
 
     run: RunDirectory
+    """Where everything goes."""
     drive: CanopenDrive
+    """Opened as the method needs it."""
     found: Capabilities
+    """What the drive has."""
     request: IdentifyRequest
+    """What is asked."""
     known: Known | None = None
+    """What completes the measured values."""
     read_supply: ReadSupply | None = None
+    """Reads the bench supply where R is asked for so."""
 
     @property
     def machine(self) -> MachineFile | None:
@@ -124,30 +114,20 @@ def require_speed(omega_max_rad_s: float, n_max_rpm: float) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What the experiments may use. Raises ConfigError: one of them leaves nothing.
-
-    Attributes
-    ----------
-    I_nom_apk : float
-        Rated current; the scale of every amplitude (A peak).
-    i_max_apk : float
-        Largest current of the envelope (A peak).
-    omega_max_rad_s : float
-        Largest mechanical speed of the envelope (rad/s).
-    V_max_v : float
-        Largest voltage (V peak).
-    i_d_max_apk : float
-        Largest d current in the frame of the rotor (A peak).
-    supply_w : float
-        Largest power that the supply of the DC link is asked for (W).
-    """
+    """What the experiments may use. Raises ConfigError: one of them leaves nothing."""
 
     I_nom_apk: float
+    """Rated current; the scale of every amplitude (A peak)."""
     i_max_apk: float
+    """Largest current of the envelope (A peak)."""
     omega_max_rad_s: float
+    """Largest mechanical speed of the envelope (rad/s)."""
     V_max_v: float
+    """Largest voltage (V peak)."""
     i_d_max_apk: float = math.inf
+    """Largest d current in the frame of the rotor (A peak)."""
     supply_w: float = math.inf
+    """Largest power that the supply of the DC link is asked for (W)."""
 
     def __post_init__(self) -> None:
         """Refuse before anything moves."""

@@ -57,30 +57,22 @@ def later_line(steps: set[str]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ShaftForecast:
-    """What is known of the shaft after the rough pushes.
-
-    Attributes
-    ----------
-    shaft : RoughShaft
-        Inertia by the pushes, friction by the run over speeds.
-    sigma_a, doubt : float
-        Noise of one sample (A), and relative standard deviation of the torque's scale but for the samples'
-        displacement.
-    R_ohm, L_q_h, psi_wb, dead_time_s, pole_pairs : float
-        For that displacement.
-    bandwidth_rad_s : float
-        Of the current loop.
-    """
+    """What is known of the shaft after the rough pushes."""
 
     shaft: RoughShaft
+    """Inertia by the pushes, friction by the run over speeds."""
     sigma_a: float
     doubt: float
+    """Noise of one sample (A), and relative standard deviation of the torque's scale but for the samples'
+    displacement."""
     R_ohm: float
     L_q_h: float
     psi_wb: float
     dead_time_s: float
     pole_pairs: int
+    """For that displacement."""
     bandwidth_rad_s: float
+    """Of the current loop."""
 
     @property
     def rough(self) -> dict[str, float]:

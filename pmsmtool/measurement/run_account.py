@@ -63,41 +63,29 @@ def begin_run(
 
 @dataclass(frozen=True, slots=True)
 class Account:
-    """How a run ended.
-
-    Attributes
-    ----------
-    state : str
-        ``open``, ``interrupted``, ``refused``, ``fail``; ``complete`` when no error ended it, whatever was measured.
-    stage : str
-        What was done last.
-    began_utc, ended_utc : str
-        When; the end is empty while it is open.
-    exit_code : int or None
-        What the program ended with (``pmsmtool help exit-codes``), where an error ended it.
-    error, what, where, likely, next_step : str
-        Name of the error, of a refused measurement its reason (``E_...``), and what was told of it.
-    restored : tuple of str
-        What was said of the stop and of what the drive holds again.
-    files : mapping of str to str
-        Complete files of the run and their SHA-256 (hex): a file has its name only when all of it is written.
-    incomplete : tuple of str
-        Files that were being written.
-    """
+    """How a run ended."""
 
     state: str
+    """``open``, ``interrupted``, ``refused``, ``fail``; ``complete`` when no error ended it, whatever was measured."""
     stage: str
+    """What was done last."""
     began_utc: str
     ended_utc: str = ""
+    """When; the end is empty while it is open."""
     exit_code: int | None = None
+    """What the program ended with (``pmsmtool help exit-codes``), where an error ended it."""
     error: str = ""
     what: str = ""
     where: str = ""
     likely: str = ""
     next_step: str = ""
+    """Name of the error, of a refused measurement its reason (``E_...``), and what was told of it."""
     restored: tuple[str, ...] = ()
+    """What was said of the stop and of what the drive holds again."""
     files: Mapping[str, str] = field(default_factory=dict)
+    """Complete files of the run and their SHA-256 (hex): a file has its name only when all of it is written."""
     incomplete: tuple[str, ...] = ()
+    """Files that were being written."""
 
 
 class RunAccount:

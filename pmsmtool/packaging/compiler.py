@@ -26,24 +26,16 @@ from pmsmtool.native import library_name
 
 @dataclass(frozen=True, slots=True)
 class Kernel:
-    """One shared library.
-
-    Attributes
-    ----------
-    name : str
-        Library name without prefix and suffix; what ``native.load`` takes.
-    sources : tuple of str
-        Globs relative to the package folder. A glob that matches nothing adds nothing.
-    defines : tuple of str
-        Preprocessor symbols besides :data:`COMMON_DEFINES`.
-    without : tuple of str
-        Sources that are left out.
-    """
+    """One shared library."""
 
     name: str
+    """Library name without prefix and suffix; what ``native.load`` takes."""
     sources: tuple[str, ...]
+    """Globs relative to the package folder. A glob that matches nothing adds nothing."""
     defines: tuple[str, ...] = ()
+    """Preprocessor symbols besides :data:`COMMON_DEFINES`."""
     without: tuple[str, ...] = ()
+    """Sources that are left out."""
 
     def source_files(self, package: Path) -> list[Path]:
         """Return the sources relative to ``package``, each once, in a fixed order."""
@@ -103,27 +95,18 @@ def is_current(library: Path, kernel: Kernel, package: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """One platform.
-
-    Attributes
-    ----------
-    name : str
-        Name on the command line of ``cross_wheels``.
-    platform : str
-        As ``sys.platform``; decides the library's file name.
-    machine : str
-        ``x86_64`` or ``aarch64``, as the library's header says it.
-    zig : str
-        Target triple of zig; with the oldest C library (Linux) or system (macOS) that must run it.
-    wheel_tag : str
-        Platform tag of the wheel (PEP 425, PEP 600).
-    """
+    """One platform."""
 
     name: str
+    """Name on the command line of ``cross_wheels``."""
     platform: str
+    """As ``sys.platform``; decides the library's file name."""
     machine: str
+    """``x86_64`` or ``aarch64``, as the library's header says it."""
     zig: str
+    """Target triple of zig; with the oldest C library (Linux) or system (macOS) that must run it."""
     wheel_tag: str
+    """Platform tag of the wheel (PEP 425, PEP 600)."""
 
 
 TARGETS: tuple[Target, ...] = (
@@ -183,21 +166,14 @@ class CompilerError(RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Compiler:
-    """A command that compiles and links a shared library.
-
-    Attributes
-    ----------
-    command : tuple of str
-        Program and leading arguments.
-    name : str
-        How to name it to a person.
-    tolerated : tuple of str
-        Flags that take back warnings this compiler gives without need.
-    """
+    """A command that compiles and links a shared library."""
 
     command: tuple[str, ...]
+    """Program and leading arguments."""
     name: str
+    """How to name it to a person."""
     tolerated: tuple[str, ...] = ()
+    """Flags that take back warnings this compiler gives without need."""
 
 
 def zig_compiler(target: Target | None) -> Compiler:

@@ -37,30 +37,20 @@ _MACHINES = {"X86_64": "x86_64", "AMD64": "x86_64", "AARCH64": "aarch64", "ARM64
 
 @dataclass(frozen=True, slots=True)
 class Binary:
-    """What the linker of another program sees.
-
-    Attributes
-    ----------
-    platform : str
-        ``linux``, ``win32`` or ``darwin``, as ``sys.platform``.
-    machine : str
-        ``x86_64`` or ``aarch64``; LIEF's name of any other.
-    exported : frozenset of str
-        Visible symbols the file defines.
-    external : frozenset of str
-        Symbols with external linkage the file defines, hidden ones too (ELF object files; else as ``exported``).
-    undefined : frozenset of str
-        Symbols the file needs from elsewhere (not for PE).
-    signed : bool
-        Mach-O with a code signature, without which an Apple-silicon machine refuses to load it.
-    """
+    """What the linker of another program sees."""
 
     platform: str
+    """``linux``, ``win32`` or ``darwin``, as ``sys.platform``."""
     machine: str
+    """``x86_64`` or ``aarch64``; LIEF's name of any other."""
     exported: frozenset[str]
+    """Visible symbols the file defines."""
     external: frozenset[str]
+    """Symbols with external linkage the file defines, hidden ones too (ELF object files; else as ``exported``)."""
     undefined: frozenset[str]
+    """Symbols the file needs from elsewhere (not for PE)."""
     signed: bool = False
+    """Mach-O with a code signature, without which an Apple-silicon machine refuses to load it."""
 
 
 def read_binary(data: bytes) -> Binary:

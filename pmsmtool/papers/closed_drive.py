@@ -52,24 +52,17 @@ _RECORDED = (Truth.T, Signal.U_D, Signal.U_Q, Signal.U_DC, Truth.TORQUE, Truth.I
 
 @dataclass(frozen=True, slots=True)
 class Seat:
-    """What a run showed, one row per control period, each shape (n,).
-
-    Attributes
-    ----------
-    t_s, rpm, torque_nm : ndarray
-        Time, speed, torque of the machine.
-    demand_v, V_max_v : ndarray
-        Voltage demanded before the limiter, and the largest the inverter has.
-    current_a : ndarray
-        Length of the current vector.
-    """
+    """What a run showed, one row per control period, each shape (n,)."""
 
     t_s: Array
     rpm: Array
     torque_nm: Array
+    """Time, speed, torque of the machine."""
     demand_v: Array
     V_max_v: Array
+    """Voltage demanded before the limiter, and the largest the inverter has."""
     current_a: Array
+    """Length of the current vector."""
 
     @property
     def saturated(self) -> int:

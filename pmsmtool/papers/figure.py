@@ -28,21 +28,14 @@ Cell = str | int | float | None
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Head of a column.
-
-    Attributes
-    ----------
-    name : str
-        Quantity.
-    unit : str
-        SI unit or ``%``, ``ms``, ``rpm``; empty for text and pure numbers.
-    digits : int
-        Significant digits shown.
-    """
+    """Head of a column."""
 
     name: str
+    """Quantity."""
     unit: str = ""
+    """SI unit or ``%``, ``ms``, ``rpm``; empty for text and pure numbers."""
     digits: int = 4
+    """Significant digits shown."""
 
     @property
     def head(self) -> str:
@@ -52,21 +45,14 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of numbers under named columns.
-
-    Attributes
-    ----------
-    title : str
-        What it shows, and under which conditions.
-    columns : tuple of Column
-        Heads.
-    rows : tuple of tuple
-        One cell per column.
-    """
+    """Rows of numbers under named columns."""
 
     title: str
+    """What it shows, and under which conditions."""
     columns: tuple[Column, ...]
+    """Heads."""
     rows: tuple[tuple[Cell, ...], ...]
+    """One cell per column."""
 
     def __post_init__(self) -> None:
         wrong = [row for row in self.rows if len(row) != len(self.columns)]
@@ -83,34 +69,23 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One number of a paper, or one that follows from it, beside ours.
-
-    Attributes
-    ----------
-    what : str
-        The number, with its conditions.
-    expected : float
-        The number in ``where``; NaN where only a bound is.
-    ours : float
-        As computed here, same unit.
-    unit : str
-        Unit of both.
-    low, high : float
-        Allowed range of ``ours``, ends included; infinite where one-sided.
-    where : str
-        Where the number comes from: what prints it, what curve it was read off, or what it was derived from.
-    printed : bool
-        Whether the paper prints this very number in ``where``; false for one read off a figure or derived.
-    """
+    """One number of a paper, or one that follows from it, beside ours."""
 
     what: str
+    """The number, with its conditions."""
     expected: float
+    """The number in ``where``; NaN where only a bound is."""
     ours: float
+    """As computed here, same unit."""
     unit: str
+    """Unit of both."""
     low: float
     high: float
+    """Allowed range of ``ours``, ends included; infinite where one-sided."""
     where: str = ""
+    """Where the number comes from: what prints it, what curve it was read off, or what it was derived from."""
     printed: bool = False
+    """Whether the paper prints this very number in ``where``; false for one read off a figure or derived."""
 
     def __post_init__(self) -> None:
         if math.isfinite(self.expected) and not self.where:
@@ -168,84 +143,56 @@ def at_least(what: str, ours: float, limit: float, unit: str, *, expected: float
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """One line or cloud of points of a panel.
-
-    Attributes
-    ----------
-    name : str
-        In the legend; empty: not in the legend.
-    x, y : ndarray, shape (n,)
-        In the units of the panel's axes.
-    style : str
-        matplotlib's short form: ``-`` response, ``--`` reference, ``:`` limit, ``.`` or ``o`` points.
-    colour : int or None
-        Number of the colour, to pair lines; None: the next one. Negative: grey.
-    """
+    """One line or cloud of points of a panel."""
 
     name: str
+    """In the legend; empty: not in the legend."""
     x: Array
     y: Array
+    """In the units of the panel's axes. Shape (n,)."""
     style: str = "-"
+    """matplotlib's short form: ``-`` response, ``--`` reference, ``:`` limit, ``.`` or ``o`` points."""
     colour: int | None = None
+    """Number of the colour, to pair lines; None: the next one. Negative: grey."""
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One pair of axes.
-
-    Attributes
-    ----------
-    title : str
-        Above the axes.
-    x_label, y_label : str
-        Quantity and unit, ``i_q / A``.
-    series : tuple of Series
-        What is drawn.
-    equal : bool
-        Same scale on both axes (current plane).
-    x_log, y_log : bool
-        Logarithmic axes.
-    x_range, y_range : tuple of float, optional
-        Shown range; all where None.
-    """
+    """One pair of axes."""
 
     title: str
+    """Above the axes."""
     x_label: str
     y_label: str
+    """Quantity and unit, ``i_q / A``."""
     series: tuple[Series, ...]
+    """What is drawn."""
     equal: bool = False
+    """Same scale on both axes (current plane)."""
     x_log: bool = False
     y_log: bool = False
+    """Logarithmic axes."""
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
+    """Shown range; all where None."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reproduction:
-    """A figure or table of a paper, recomputed; its name and title are in the registry.
-
-    Attributes
-    ----------
-    source : str
-        Paper and figure, DOI.
-    tables : tuple of Table
-        Numbers.
-    panels : tuple of Panel
-        Plot; empty for a table alone.
-    checks : tuple of Check
-        Printed and expected numbers beside ours.
-    notes : tuple of str
-        Conditions, assumptions, and what differs from the paper and why.
-    columns : int
-        Panels side by side.
-    """
+    """A figure or table of a paper, recomputed; its name and title are in the registry."""
 
     source: str
+    """Paper and figure, DOI."""
     tables: tuple[Table, ...] = ()
+    """Numbers."""
     panels: tuple[Panel, ...] = ()
+    """Plot; empty for a table alone."""
     checks: tuple[Check, ...] = ()
+    """Printed and expected numbers beside ours."""
     notes: tuple[str, ...] = ()
+    """Conditions, assumptions, and what differs from the paper and why."""
     columns: int = 1
+    """Panels side by side."""
 
     @property
     def good(self) -> bool:

@@ -72,63 +72,42 @@ BOOST_S, REST_S = 0.03, 0.15
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """A control law.
-
-    Attributes
-    ----------
-    name : str
-        In tables and legends.
-    governor : str
-        Mode of the governor (``design.governor.MODES``).
-    anti_windup : bool
-        Realizable-reference back-calculation; without it the integrators charge against the clipped voltage.
-    alpha : float
-        Bandwidth of the current loops (rad/s), pole-zero cancellation.
-    hexagon : bool
-        The inverter's hexagon instead of the circle.
-    eps : float or None
-        Tightening of the steady-state row; None: as ``tune`` chooses.
-    weakening : str
-        Mode of field weakening.
-    I_transient_apk : float or None
-        Current the governor allows on the way; None: I_max.
-    """
+    """A control law."""
 
     name: str
+    """In tables and legends."""
     governor: str = "off"
+    """Mode of the governor (``design.governor.MODES``)."""
     anti_windup: bool = True
+    """Realizable-reference back-calculation; without it the integrators charge against the clipped voltage."""
     alpha: float = FAST
+    """Bandwidth of the current loops (rad/s), pole-zero cancellation."""
     hexagon: bool = False
+    """The inverter's hexagon instead of the circle."""
     eps: float | None = None
+    """Tightening of the steady-state row; None: as ``tune`` chooses."""
     weakening: str = "accelerated"
+    """Mode of field weakening."""
     I_transient_apk: float | None = None
+    """Current the governor allows on the way; None: I_max."""
 
 
 @dataclass(frozen=True, slots=True)
 class Condition:
-    """What the law works with.
-
-    Attributes
-    ----------
-    name : str
-        In tables.
-    delayed : bool
-        One period of computation delay; the laws then predict one step (all of them, or none).
-    noise : bool
-        Noisy, quantised current samples.
-    R, L, psi : float
-        Plant over controller.
-    whole : bool
-        The drive's whole firmware on the profile's own inverter, sensors and encoder, instead of ideal ones.
-    """
+    """What the law works with."""
 
     name: str = "nominal"
+    """In tables."""
     delayed: bool = False
+    """One period of computation delay; the laws then predict one step (all of them, or none)."""
     noise: bool = False
+    """Noisy, quantised current samples."""
     R: float = 1.0
     L: float = 1.0
     psi: float = 1.0
+    """Plant over controller."""
     whole: bool = False
+    """The drive's whole firmware on the profile's own inverter, sensors and encoder, instead of ideal ones."""
 
 
 NOMINAL = Condition()
@@ -150,21 +129,15 @@ def V_max() -> float:
 
 @dataclass(frozen=True, slots=True)
 class Plant:
-    """Constants of the simulated machine.
-
-    Attributes
-    ----------
-    R, L_d, L_q, psi : float
-        Ohm, H, H, Wb.
-    pole_pairs : int
-        Pole pairs.
-    """
+    """Constants of the simulated machine."""
 
     R: float
     L_d: float
     L_q: float
     psi: float
+    """Ohm, H, H, Wb."""
     pole_pairs: int
+    """Pole pairs."""
 
     def voltage(self, i: Array, rpm: Array | float) -> Array:
         """Return the steady-state voltage (V) of currents, shape (..., 2), at a speed."""
@@ -224,34 +197,23 @@ def law_values(law: Law, delayed: bool) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What a run showed, one row per control period, from the step on.
-
-    Attributes
-    ----------
-    t_s : ndarray, shape (n,)
-        Time since the step (s).
-    i : ndarray, shape (n, 2)
-        True current at the sampling instants (A).
-    reference : ndarray, shape (n, 2)
-        Governed reference (A).
-    demanded : ndarray, shape (n, 2)
-        Voltage the controller asked for (V), before the limiter.
-    applied : ndarray, shape (n, 2)
-        After the limiter.
-    flags : ndarray, shape (n,)
-        Flags of the core.
-    rpm, theta_e : ndarray, shape (n,)
-        Speed (rpm) and electrical angle (rad).
-    """
+    """What a run showed, one row per control period, from the step on."""
 
     t_s: Array
+    """Time since the step (s). Shape (n,)."""
     i: Array
+    """True current at the sampling instants (A). Shape (n, 2)."""
     reference: Array
+    """Governed reference (A). Shape (n, 2)."""
     demanded: Array
+    """Voltage the controller asked for (V), before the limiter. Shape (n, 2)."""
     applied: Array
+    """After the limiter. Shape (n, 2)."""
     flags: Whole
+    """Flags of the core. Shape (n,)."""
     rpm: Array
     theta_e: Array
+    """Speed (rpm) and electrical angle (rad). Shape (n,)."""
 
     @property
     def T_s(self) -> float:

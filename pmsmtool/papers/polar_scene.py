@@ -72,24 +72,16 @@ NOISE_A = 0.05
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """What stands between controller and machine.
-
-    Attributes
-    ----------
-    name : str
-        In titles.
-    delay_periods : float
-        0.5: the voltage acts in the period it is computed in; 1.5: one period later.
-    simulation : mapping
-        ``[simulation]`` keys.
-    application : Application
-        The control core with the exact speed, or the drive's whole firmware.
-    """
+    """What stands between controller and machine."""
 
     name: str
+    """In titles."""
     delay_periods: float
+    """0.5: the voltage acts in the period it is computed in; 1.5: one period later."""
     simulation: Mapping[str, Value]
+    """``[simulation]`` keys."""
     application: Application = Application.CORE
+    """The control core with the exact speed, or the drive's whole firmware."""
 
 
 SIMULATION = Bench("ideal inverter and sensors, no delay", 0.5, IDEAL)
@@ -101,31 +93,21 @@ EXPERIMENT = Bench("whole drive: delay, dead time, noise, 12 bit, encoder", 1.5,
 
 @dataclass(frozen=True, slots=True)
 class Controller:
-    """One way to control the current.
-
-    Attributes
-    ----------
-    name : str
-        In tables.
-    law : str
-        Law of ``tune --controller polar``; empty: field-oriented.
-    options : int
-        ``polar.options`` in place of what ``tune`` chooses; -1: as tuned.
-    values : tuple of (str, float)
-        Further values of the catalogue.
-    request : TuneRequest
-        What is asked of ``tune`` besides; a polar law weakens the field itself unless it asks for the table.
-    cdm : bool
-        Field-oriented gains of the coefficient diagram method with tau = 10 T_u in place of the tuned ones, so that
-        no bandwidth separates them from the paper's linear-range law.
-    """
+    """One way to control the current."""
 
     name: str
+    """In tables."""
     law: str = ""
+    """Law of ``tune --controller polar``; empty: field-oriented."""
     options: int = -1
+    """``polar.options`` in place of what ``tune`` chooses; -1: as tuned."""
     values: tuple[tuple[str, float], ...] = ()
+    """Further values of the catalogue."""
     request: TuneRequest = field(default_factory=TuneRequest)
+    """What is asked of ``tune`` besides; a polar law weakens the field itself unless it asks for the table."""
     cdm: bool = False
+    """Field-oriented gains of the coefficient diagram method with tau = 10 T_u in place of the tuned ones, so that
+    no bandwidth separates them from the paper's linear-range law."""
 
 
 CONVENTIONAL = Controller("conventional (PID on error)", "conventional", 0)
@@ -198,38 +180,27 @@ def _cdm_gains(source: MachineFile) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """A run in the paper's units, one entry per control period, shape (n,) each.
-
-    Attributes
-    ----------
-    t : ndarray
-        Time (s).
-    i_d, i_q : ndarray
-        True currents (A, power-invariant).
-    torque, torque_asked : ndarray
-        True torque and its reference (N m).
-    V_a, delta : ndarray
-        Signed voltage amplitude (V, power-invariant) and phase (rad, within +-pi/2) of the demand.
-    u_d, u_q : ndarray
-        The demand (V, power-invariant).
-    v_d, v_q : ndarray
-        What the inverter's limits leave of it (V, power-invariant).
-    speed_rpm : ndarray
-        Mechanical speed (rpm).
-    """
+    """A run in the paper's units, one entry per control period, shape (n,) each."""
 
     t: Array
+    """Time (s)."""
     i_d: Array
     i_q: Array
+    """True currents (A, power-invariant)."""
     torque: Array
     torque_asked: Array
+    """True torque and its reference (N m)."""
     V_a: Array
     delta: Array
+    """Signed voltage amplitude (V, power-invariant) and phase (rad, within +-pi/2) of the demand."""
     u_d: Array
     u_q: Array
+    """The demand (V, power-invariant)."""
     v_d: Array
     v_q: Array
+    """What the inverter's limits leave of it (V, power-invariant)."""
     speed_rpm: Array
+    """Mechanical speed (rpm)."""
 
     def index(self, t: float) -> int:
         """Return the first period at or after a time."""

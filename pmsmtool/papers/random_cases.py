@@ -184,27 +184,18 @@ _BISECTIONS, _CIRCLE = 60, 180
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a law made of a set of cases, one entry per case.
-
-    Attributes
-    ----------
-    settling_s : ndarray
-        Time of the first sample from which on the current stays in the band (s); infinite for never.
-    peak_a : ndarray
-        Largest current (A).
-    demand : ndarray
-        Largest demanded voltage over V_max.
-    applied : ndarray
-        Largest voltage after the limiter over V_max.
-    final_a : ndarray
-        Distance from the target at the end (A).
-    """
+    """What a law made of a set of cases, one entry per case."""
 
     settling_s: Array
+    """Time of the first sample from which on the current stays in the band (s); infinite for never."""
     peak_a: Array
+    """Largest current (A)."""
     demand: Array
+    """Largest demanded voltage over V_max."""
     applied: Array
+    """Largest voltage after the limiter over V_max."""
     final_a: Array
+    """Distance from the target at the end (A)."""
 
 
 def run_cases(

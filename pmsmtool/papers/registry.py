@@ -21,27 +21,18 @@ MIYAJIMA = "Miyajima, Fujimoto, Fujitsuna 2013"
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One figure.
-
-    Attributes
-    ----------
-    name : str
-        What is typed; kebab-case.
-    target : str
-        ``module:function`` in this package; the function is called with the seed.
-    title : str
-        One line.
-    source : str
-        Paper; ours where the figure is not printed there.
-    run_s : float
-        Time it takes on one core of about 2020 (s), roughly.
-    """
+    """One figure."""
 
     name: str
+    """What is typed; kebab-case."""
     target: str
+    """``module:function`` in this package; the function is called with the seed."""
     title: str
+    """One line."""
     source: str
+    """Paper; ours where the figure is not printed there."""
     run_s: float
+    """Time it takes on one core of about 2020 (s), roughly."""
 
 
 FIGURES: tuple[Row, ...] = (

@@ -38,32 +38,22 @@ def settling_ms(t: Array, x: Array, target: float, band: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TorqueStep:
-    """A step of the torque up and down again.
-
-    Attributes
-    ----------
-    up_ms, down_ms : float
-        5 % settling of i_q (ms).
-    over_up, over_down : float
-        Overshoot of i_q (% of the step).
-    peak_a : float
-        Largest i_d after the step down (A).
-    area_mas : float
-        Integral of positive i_d over 30 ms after it (mA s).
-    end_a : float
-        i_d at the end (A).
-    loss_w : float
-        Copper loss at the end of the large torque (W).
-    """
+    """A step of the torque up and down again."""
 
     up_ms: float
     down_ms: float
+    """5 % settling of i_q (ms)."""
     over_up: float
     over_down: float
+    """Overshoot of i_q (% of the step)."""
     peak_a: float
+    """Largest i_d after the step down (A)."""
     area_mas: float
+    """Integral of positive i_d over 30 ms after it (mA s)."""
     end_a: float
+    """i_d at the end (A)."""
     loss_w: float
+    """Copper loss at the end of the large torque (W)."""
 
 
 def torque_step(r: Response, up_s: float, down_s: float, low_nm: float, high_nm: float) -> TorqueStep:

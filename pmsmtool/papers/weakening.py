@@ -53,25 +53,17 @@ CURRENT_A = 56.5
 
 @dataclass(frozen=True, slots=True)
 class Sweep:
-    """A torque held over a speed ramp.
-
-    Attributes
-    ----------
-    law, condition : Law, Condition
-        What ran.
-    response : Response
-        What was seen.
-    error : ndarray, shape (n,)
-        (|v_ss| - V_m) / V_m (%), of the plant's own steady-state voltage.
-    torque_nm : ndarray, shape (n,)
-        Torque of the plant.
-    """
+    """A torque held over a speed ramp."""
 
     law: Law
     condition: Condition
+    """What ran."""
     response: Response
+    """What was seen."""
     error: Array
+    """(|v_ss| - V_m) / V_m (%), of the plant's own steady-state voltage. Shape (n,)."""
     torque_nm: Array
+    """Torque of the plant. Shape (n,)."""
 
     @property
     def row(self) -> tuple[str | float, ...]:

@@ -37,36 +37,25 @@ WireType = Literal["UNSIGNED8", "UNSIGNED16", "UNSIGNED32", "REAL32"]
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter of the drive.
-
-    Attributes
-    ----------
-    name : str
-        Catalogue name, ``group.key``; the unit is the key's suffix.
-    index, sub : int
-        Object in the reference drive's dictionary.
-    wire : WireType
-        CiA 301 data type of that object.
-    unit : str
-        SI unit, as in ``units.UNITS``.
-    default, minimum, maximum : float
-        Factory value and inclusive bounds, in SI.
-    live : bool
-        Whether the drive takes a change while it is enabled (RPDO-mappable gain).
-    meaning : str
-        One line for help texts and C comments.
-    """
+    """One parameter of the drive."""
 
     name: str
+    """Catalogue name, ``group.key``; the unit is the key's suffix."""
     index: int
     sub: int
+    """Object in the reference drive's dictionary."""
     wire: WireType
+    """CiA 301 data type of that object."""
     unit: str
+    """SI unit, as in ``units.UNITS``."""
     default: float
     minimum: float
     maximum: float
+    """Factory value and inclusive bounds, in SI."""
     live: bool
+    """Whether the drive takes a change while it is enabled (RPDO-mappable gain)."""
     meaning: str
+    """One line for help texts and C comments."""
 
     @property
     def is_integer(self) -> bool:

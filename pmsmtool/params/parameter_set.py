@@ -252,26 +252,18 @@ def _look_up_violations(
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One entry that two sets do not share.
-
-    Attributes
-    ----------
-    name : str
-        Catalogue or table name.
-    old, new : float or None
-        Values in SI, None where a set has no such entry; for a table the entries that differ are
-        counted in ``cells`` and ``old``, ``new`` are those of the first one.
-    unit : str
-        Unit of both.
-    cells : int
-        How many numbers of a table differ; 0 for a scalar.
-    """
+    """One entry that two sets do not share."""
 
     name: str
+    """Catalogue or table name."""
     old: float | None
     new: float | None
+    """Values in SI, None where a set has no such entry; for a table the entries that differ are
+    counted in ``cells`` and ``old``, ``new`` are those of the first one."""
     unit: str
+    """Unit of both."""
     cells: int = 0
+    """How many numbers of a table differ; 0 for a scalar."""
 
     @property
     def relative(self) -> float:

@@ -29,35 +29,24 @@ overshoot take current, too. Of a winding that warms with 4.4 s, a step from 105
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What the drive reports before anything moves, and what it may do.
-
-    Attributes
-    ----------
-    U_dc_v : float
-        DC link as measured (V).
-    T_winding_c, T_magnet_c : float
-        As measured; NaN without a sensor.
-    encoder_counts : int
-        Counts per turn, 0 when the drive does not tell.
-    i_max_apk, speed_max_rad_s : float
-        The envelope.
-    shaft : str
-        ``free``, ``locked`` or ``coupled``.
-    U_dc_ripple_v : float
-        Amplitude of the link's ripple (V).
-    offsets_apk : (float, float, float)
-        Currents that the sensors of a, b, c show without current (A), less their mean.
-    """
+    """What the drive reports before anything moves, and what it may do."""
 
     U_dc_v: float
+    """DC link as measured (V)."""
     T_winding_c: float
     T_magnet_c: float
+    """As measured; NaN without a sensor."""
     encoder_counts: int
+    """Counts per turn, 0 when the drive does not tell."""
     i_max_apk: float
     speed_max_rad_s: float
+    """The envelope."""
     shaft: str = "free"
+    """``free``, ``locked`` or ``coupled``."""
     U_dc_ripple_v: float = 0.0
+    """Amplitude of the link's ripple (V)."""
     offsets_apk: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Currents that the sensors of a, b, c show without current (A), less their mean."""
 
     def facts(self) -> dict[str, Any]:
         """Return them as JSON; what is not known is None."""

@@ -112,21 +112,14 @@ RIPPLE_TOLD = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """One judged signal or quantity.
-
-    Attributes
-    ----------
-    what : str
-        Experiment and signal, or the quantity.
-    share : float
-        Largest deviation over the half width of the band; at most one is inside.
-    where : str
-        Where the largest deviation is, or value and band of a quantity.
-    """
+    """One judged signal or quantity."""
 
     what: str
+    """Experiment and signal, or the quantity."""
     share: float
+    """Largest deviation over the half width of the band; at most one is inside."""
     where: str
+    """Where the largest deviation is, or value and band of a quantity."""
 
     @property
     def inside(self) -> bool:

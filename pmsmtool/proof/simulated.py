@@ -84,31 +84,21 @@ what is left of the start shifts the prediction (64 periods, 1 L/R, of a warm wi
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """How one machine enters one experiment: by chance, and anew each time.
-
-    Attributes
-    ----------
-    base_speed : float
-        Speed held before current steps, relative to the one asked for, less one.
-    phase, coasting : int
-        Control periods of the drive's slower tasks that have passed, and without current before a current step.
-    held : float
-        Torque that holds the shaft before a move, of the Coulomb torque.
-    theta_M_rad : float
-        Angle of the shaft (rad).
-    weakened : float
-        d current that field weakening without a table starts from, of the one of least current at rated torque.
-    cogging : float
-        Of a move: share of the largest usual cogging.
-    """
+    """How one machine enters one experiment: by chance, and anew each time."""
 
     base_speed: float
+    """Speed held before current steps, relative to the one asked for, less one."""
     phase: int
     coasting: int
+    """Control periods of the drive's slower tasks that have passed, and without current before a current step."""
     held: float
+    """Torque that holds the shaft before a move, of the Coulomb torque."""
     theta_M_rad: float
+    """Angle of the shaft (rad)."""
     weakened: float
+    """d current that field weakening without a table starts from, of the one of least current at rated torque."""
     cogging: float
+    """Of a move: share of the largest usual cogging."""
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Start:

@@ -76,32 +76,23 @@ class SimulationTask:
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """One quantity over the simulated drives.
-
-    Attributes
-    ----------
-    name, unit : str
-        ``simulated_current`` 1 - peak |i| / I_max, ``simulated_voltage`` 1 - peak |u| / V_max (transients may use all
-        of it), ``simulated_thermal`` 1 - mean |i|^2 / I_cont^2, ``simulated_speed`` 1 - peak speed / trip speed,
-        ``simulated_feasible`` share of the periods in which governor and field weakening found an admissible
-        current, ``simulated_torque`` mean |torque| over that of the nominal drive; unit 1.
-    nominal, worst : float
-        Of the nominal drive; the least of all.
-    worst_sample : mapping of str to float
-        The machine that did worst.
-    percentiles : mapping of float to float
-        Over the drives.
-    least : float or None
-        What was asked.
-    """
+    """One quantity over the simulated drives."""
 
     name: str
     unit: str
+    """``simulated_current`` 1 - peak |i| / I_max, ``simulated_voltage`` 1 - peak |u| / V_max (transients may use all
+    of it), ``simulated_thermal`` 1 - mean |i|^2 / I_cont^2, ``simulated_speed`` 1 - peak speed / trip speed,
+    ``simulated_feasible`` share of the periods in which governor and field weakening found an admissible
+    current, ``simulated_torque`` mean |torque| over that of the nominal drive; unit 1."""
     nominal: float
     worst: float
+    """Of the nominal drive; the least of all."""
     worst_sample: Mapping[str, float]
+    """The machine that did worst."""
     percentiles: Mapping[float, float]
+    """Over the drives."""
     least: float | None
+    """What was asked."""
 
     @property
     def ok(self) -> bool:
@@ -111,30 +102,20 @@ class Observed:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedMargins:
-    """What the drives of a box did.
-
-    Attributes
-    ----------
-    scenario : str
-        What was simulated.
-    duration_s : float
-        For how long (s).
-    drives : int
-        How many.
-    quantities : tuple of Observed
-        Over all of them.
-    trips : mapping of str to int
-        Trips by name, and how many drives had them.
-    outside_flux_map : int
-        Drives that left their flux map, whose numbers are to be doubted.
-    """
+    """What the drives of a box did."""
 
     scenario: str
+    """What was simulated."""
     duration_s: float
+    """For how long (s)."""
     drives: int
+    """How many."""
     quantities: tuple[Observed, ...]
+    """Over all of them."""
     trips: Mapping[str, int]
+    """Trips by name, and how many drives had them."""
     outside_flux_map: int
+    """Drives that left their flux map, whose numbers are to be doubted."""
 
     @property
     def ok(self) -> bool:
@@ -314,39 +295,26 @@ SHIFT = int(Setup.sampling_shift.offset)
 
 @dataclass(frozen=True, slots=True)
 class StepTask:
-    """Everything that decides the bytes of the step.
-
-    Attributes
-    ----------
-    image : bytes
-        Parameter image of the drive.
-    setups : sequence of bytes
-        The machine as designed, then the drawn ones.
-    schedules : sequence of (target, times in s, values)
-        What is asked.
-    mode : int
-        Of the drive.
-    periods : int
-        Control periods that are run.
-    T_s : float
-        Control period (s).
-    step_s : float
-        When the step is asked (s).
-    U_dc_v : float
-        DC link (V).
-    scenario : Scenario
-        Where the above come from.
-    """
+    """Everything that decides the bytes of the step."""
 
     image: bytes
+    """Parameter image of the drive."""
     setups: Sequence[bytes]
+    """The machine as designed, then the drawn ones."""
     schedules: Sequence[tuple[int, Sequence[float], Sequence[float]]]
+    """What is asked. Sequence of (target, times in s, values)."""
     mode: int
+    """Of the drive."""
     periods: int
+    """Control periods that are run."""
     T_s: float
+    """Control period (s)."""
     step_s: float
+    """When the step is asked (s)."""
     U_dc_v: float
+    """DC link (V)."""
     scenario: Scenario
+    """Where the above come from."""
 
 
 def step_task(design: Design, drawn: int = DRAWN) -> StepTask:

@@ -74,28 +74,20 @@ intervals (seen: 9 in the field weakening of a machine of 4e-6 kg m2; 1.3 of a h
 
 @dataclass(frozen=True, slots=True)
 class ProofRequest:
-    """What is asked, and what the machine may do meanwhile; None leaves the choice to the design's ratings.
-
-    Attributes
-    ----------
-    i_max_apk, speed_max_rad_s : float or None
-        Envelope (A peak, rad/s mechanical).
-    shaft, load, brake : str
-        What hangs on the shaft; it must be what the design was made for.
-    runs, seed : int
-        Machines drawn for the prediction, and the seed of the draw.
-    experiments : tuple of str
-        Names of the experiments the drive can show; empty: all.
-    """
+    """What is asked, and what the machine may do meanwhile; None leaves the choice to the design's ratings."""
 
     i_max_apk: float | None = None
     speed_max_rad_s: float | None = None
+    """Envelope (A peak, rad/s mechanical)."""
     shaft: Shaft = "free"
     load: Load = "none"
     brake: Brake = "none"
+    """What hangs on the shaft; it must be what the design was made for."""
     runs: int = RUNS
     seed: int = 0
+    """Machines drawn for the prediction, and the seed of the draw."""
     experiments: tuple[str, ...] = ()
+    """Names of the experiments the drive can show; empty: all."""
 
 
 @dataclass(slots=True)

@@ -128,21 +128,15 @@ RPM_PER_RAD_S = 9.549296585513721
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One pair of axes: a label with its unit, and the signals drawn in it.
-
-    Attributes
-    ----------
-    label : str
-        Quantity and unit of the axis.
-    lines : sequence of (signal, name, style)
-        Signal of the trace, name in the legend, ``-`` for a measurement and ``--`` for a reference.
-    factor : float
-        From the signal's unit to the axis's.
-    """
+    """One pair of axes: a label with its unit, and the signals drawn in it."""
 
     label: str
+    """Quantity and unit of the axis."""
     lines: Sequence[tuple[str, str, str]]
+    """Signal of the trace, name in the legend, ``-`` for a measurement and ``--`` for a reference.
+    Sequence of (signal, name, style)."""
     factor: float = 1.0
+    """From the signal's unit to the axis's."""
 
 
 PANELS: tuple[Panel, ...] = (

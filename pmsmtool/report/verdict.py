@@ -56,24 +56,16 @@ OUTCOME = {"pass": "", "partial": "skipped", "fail": "failure"}
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What a run is worth.
-
-    Attributes
-    ----------
-    kind : str
-        ``pass``, ``partial`` or ``fail``.
-    word : str
-        ``PASS``, ``PARTIAL``, ``FAIL`` or ``STOP NOT CONFIRMED``.
-    lines : tuple of str
-        Its reasons; the first one completes the headline.
-    simulated : bool
-        Whether a simulated drive answered, as far as its identity says so.
-    """
+    """What a run is worth."""
 
     kind: Literal["pass", "partial", "fail"]
+    """``pass``, ``partial`` or ``fail``."""
     word: str
+    """``PASS``, ``PARTIAL``, ``FAIL`` or ``STOP NOT CONFIRMED``."""
     lines: tuple[str, ...]
+    """Its reasons; the first one completes the headline."""
     simulated: bool = False
+    """Whether a simulated drive answered, as far as its identity says so."""
 
     @property
     def headline(self) -> str:

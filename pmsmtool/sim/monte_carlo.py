@@ -31,62 +31,43 @@ THREADS_MAX = 64
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """One machine among many.
-
-    Attributes
-    ----------
-    R, L_d, L_q, psi_f, J : float
-        Factors over the machine file; L_d and L_q of what the currents add to a flux map.
-    encoder_rad : float
-        Electrical angle that the encoder's offset is off (rad).
-    T_winding_c, T_magnet_c, U_dc_v : float or None
-        Temperatures (degC) and DC link (V); the machine file's where none is given.
-    seed : int
-        Of the sensors' noise.
-    """
+    """One machine among many."""
 
     R: float = 1.0
     L_d: float = 1.0
     L_q: float = 1.0
     psi_f: float = 1.0
     J: float = 1.0
+    """Factors over the machine file; L_d and L_q of what the currents add to a flux map."""
     encoder_rad: float = 0.0
+    """Electrical angle that the encoder's offset is off (rad)."""
     T_winding_c: float | None = None
     T_magnet_c: float | None = None
     U_dc_v: float | None = None
+    """Temperatures (degC) and DC link (V); the machine file's where none is given."""
     seed: int = 0
+    """Of the sensors' noise."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveRuns:
-    """What is kept of every drive, of its machine and not of what its sensors say; each shape (n,).
-
-    Attributes
-    ----------
-    i_peak_a, i_rms_a : ndarray
-        Largest current amplitude at the end of a control period, and its root mean square (A peak).
-    torque_nm : ndarray
-        Mean amount of the torque (N m).
-    omega_peak_rad_s : ndarray
-        Largest mechanical speed (rad/s).
-    u_peak : ndarray
-        Largest voltage demanded, behind the limiter, over the DC link.
-    infeasible : ndarray
-        Share of the periods with no admissible current at all.
-    trip : ndarray of int
-        Latched trip as CiA 402 error code, 0 without.
-    outside : ndarray of int
-        Evaluations outside the flux map.
-    """
+    """What is kept of every drive, of its machine and not of what its sensors say; each shape (n,)."""
 
     i_peak_a: Array
     i_rms_a: Array
+    """Largest current amplitude at the end of a control period, and its root mean square (A peak)."""
     torque_nm: Array
+    """Mean amount of the torque (N m)."""
     omega_peak_rad_s: Array
+    """Largest mechanical speed (rad/s)."""
     u_peak: Array
+    """Largest voltage demanded, behind the limiter, over the DC link."""
     infeasible: Array
+    """Share of the periods with no admissible current at all."""
     trip: NDArray[np.int64]
+    """Latched trip as CiA 402 error code, 0 without."""
     outside: NDArray[np.int64]
+    """Evaluations outside the flux map."""
 
 
 _Task, _RESULT = STRUCTS["pmsm_monte_carlo"], np.dtype(STRUCTS["pmsm_drive_run"])

@@ -23,24 +23,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class SimulatedDrive:
-    """A machine and the parameters of its drive.
-
-    Attributes
-    ----------
-    machine : MachineFile
-        Machine and ``[simulation]``.
-    params : ParameterSet
-        What the drive runs with.
-    origin : str
-        ``design``, or how the parameters were found.
-    notes : tuple of str
-        What its design has to say.
-    """
+    """A machine and the parameters of its drive."""
 
     machine: MachineFile
+    """Machine and ``[simulation]``."""
     params: ParameterSet
+    """What the drive runs with."""
     origin: str
+    """``design``, or how the parameters were found."""
     notes: tuple[str, ...] = ()
+    """What its design has to say."""
 
 
 def find_drive(source: str | Path | Design | MachineFile, params: Path | None = None) -> SimulatedDrive:

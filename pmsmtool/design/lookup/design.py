@@ -107,28 +107,19 @@ class LookupRequest:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LookupDesign(Summarised):
-    """A table with what must be known of it.
-
-    Attributes
-    ----------
-    table : LookupTable
-        As stored in the drive.
-    stored : {"float32", "int16"}
-        Its format.
-    error : InterpolationError
-        Bounds between its nodes.
-    notes : tuple of str
-        What a person must know.
-    torque_bound, voltage_bound : float
-        What its grid was refined to, over the largest torque and the voltage limit; infinite for uniform axes.
-    """
+    """A table with what must be known of it."""
 
     table: LookupTable
+    """As stored in the drive."""
     stored: StoredFormat
+    """Its format. One of "float32", "int16"."""
     error: InterpolationError
+    """Bounds between its nodes."""
     notes: tuple[str, ...]
+    """What a person must know."""
     torque_bound: float = math.inf
     voltage_bound: float = math.inf
+    """What its grid was refined to, over the largest torque and the voltage limit; infinite for uniform axes."""
 
     def summary(self) -> Summary:
         """Return how large the table is, what binds in its cells, and what interpolation does between them."""

@@ -46,24 +46,16 @@ Axes = tuple[Array, Array, Array]
 
 @dataclass(frozen=True, slots=True)
 class InterpolationError:
-    """Largest errors of a stored table between its nodes, each a bound (``BOUND_SAFETY`` included).
-
-    Attributes
-    ----------
-    torque_nm : float
-        |torque of the interpolated currents - nearest admissible torque| (N m).
-    voltage_v : float
-        Voltage beyond the limit (V; Wb for a flux table); 0 when it is never exceeded.
-    current_a : float
-        Current beyond I_max (A); 0 when it is never exceeded.
-    holes : int
-        Cells with a corner without a point; the bounds hold outside them only as far as points exist.
-    """
+    """Largest errors of a stored table between its nodes, each a bound (``BOUND_SAFETY`` included)."""
 
     torque_nm: float
+    """|torque of the interpolated currents - nearest admissible torque| (N m)."""
     voltage_v: float
+    """Voltage beyond the limit (V; Wb for a flux table); 0 when it is never exceeded."""
     current_a: float
+    """Current beyond I_max (A); 0 when it is never exceeded."""
     holes: int
+    """Cells with a corner without a point; the bounds hold outside them only as far as points exist."""
 
 
 def stored_axes(*axes: Array) -> tuple[Array, ...]:
@@ -154,22 +146,15 @@ def _bounds(table: LookupTable, errors: Array) -> InterpolationError:
 
 @dataclass(frozen=True, slots=True)
 class GridBounds:
-    """What is asked of a grid.
-
-    Attributes
-    ----------
-    torque_nm, voltage_v : float
-        Largest error between the nodes.
-    stored : {"float32", "int16"}
-        Number format in the drive.
-    capacity_words : int
-        Four-byte words for axes and tables.
-    """
+    """What is asked of a grid."""
 
     torque_nm: float
     voltage_v: float
+    """Largest error between the nodes."""
     stored: StoredFormat = "float32"
+    """Number format in the drive. One of "float32", "int16"."""
     capacity_words: int = LUT_CAPACITY_WORDS
+    """Four-byte words for axes and tables."""
 
 
 def table_words(n_x: int, n_y: int, n_z: int, stored: StoredFormat) -> int:

@@ -71,49 +71,34 @@ class TorqueLimits:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LookupTable:
-    """References over torque (x), speed or flux limit (y) and DC-link voltage (z).
-
-    Attributes
-    ----------
-    machine : OperatingMachine
-        Machine and temperatures the table is for.
-    axis_kind : {"speed", "flux"}
-        What y is.
-    torque_nm : ndarray, shape (n_x,)
-        Torque axis (N m), both signs as wanted.
-    y : ndarray, shape (n_y,)
-        Mechanical speed (rpm) or flux limit (Wb).
-    U_dc_v : ndarray, shape (n_z,)
-        DC-link voltage (V); one entry for a table without that axis.
-    V_max_v : ndarray, shape (n_z,)
-        Voltage limit used (V peak); for a flux table of no meaning.
-    I_max_apk, i_d_min_a : float
-        Current limits (A); minus infinity where there is no demagnetisation limit.
-    i_d_a, i_q_a, achieved_torque_nm : ndarray, shape (n_x, n_y, n_z)
-        References (A peak) and their torque (N m); NaN in cells without a point.
-    limits : ndarray of uint8, shape (n_x, n_y, n_z)
-        Bits of the limits that bind (:func:`binding_name`).
-    margin_v, margin_i : ndarray, shape (n_x, n_y, n_z)
-        V_max - |v| (V; Wb for a flux table) and I_max - |i| (A) of the stored currents.
-    torque_limits : TorqueLimits
-        Per (y, z).
-    """
+    """References over torque (x), speed or flux limit (y) and DC-link voltage (z)."""
 
     machine: OperatingMachine
+    """Machine and temperatures the table is for."""
     axis_kind: AxisKind
+    """What y is. One of "speed", "flux"."""
     torque_nm: Array
+    """Torque axis (N m), both signs as wanted. Shape (n_x,)."""
     y: Array
+    """Mechanical speed (rpm) or flux limit (Wb). Shape (n_y,)."""
     U_dc_v: Array
+    """DC-link voltage (V); one entry for a table without that axis. Shape (n_z,)."""
     V_max_v: Array
+    """Voltage limit used (V peak); for a flux table of no meaning. Shape (n_z,)."""
     I_max_apk: float
     i_d_min_a: float
+    """Current limits (A); minus infinity where there is no demagnetisation limit."""
     i_d_a: Array
     i_q_a: Array
     achieved_torque_nm: Array
+    """References (A peak) and their torque (N m); NaN in cells without a point. Shape (n_x, n_y, n_z)."""
     limits: NDArray[np.uint8]
+    """Bits of the limits that bind (:func:`binding_name`). Shape (n_x, n_y, n_z)."""
     margin_v: Array
     margin_i: Array
+    """V_max - |v| (V; Wb for a flux table) and I_max - |i| (A) of the stored currents. Shape (n_x, n_y, n_z)."""
     torque_limits: TorqueLimits
+    """Per (y, z)."""
 
     @property
     def margin_torque_nm(self) -> Array:
@@ -329,20 +314,14 @@ STANDSTILL_V = 1e9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Locus:
-    """Operating points along a line, each shape (n,); NaN where there is none.
-
-    Attributes
-    ----------
-    torque_nm, i_d_a, i_q_a : ndarray
-        Torque (N m) and its currents (A peak).
-    speed_rpm : ndarray
-        Mechanical speed (rpm); zero for MTPA.
-    """
+    """Operating points along a line, each shape (n,); NaN where there is none."""
 
     torque_nm: Array
     i_d_a: Array
     i_q_a: Array
+    """Torque (N m) and its currents (A peak)."""
     speed_rpm: Array
+    """Mechanical speed (rpm); zero for MTPA."""
 
 
 def mtpa_locus(machine: OperatingMachine, I_max_apk: float, i_d_min_a: float = -math.inf, points: int = 101) -> Locus:

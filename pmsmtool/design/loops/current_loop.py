@@ -46,38 +46,25 @@ class Method(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CurrentGains:
-    """Gains of one axis.
-
-    Attributes
-    ----------
-    K_p : float
-        Proportional gain (V/A).
-    K_i : float
-        Integral gain (V/(A s)).
-    """
+    """Gains of one axis."""
 
     K_p: float
+    """Proportional gain (V/A)."""
     K_i: float
+    """Integral gain (V/(A s))."""
 
 
 @dataclass(frozen=True, slots=True)
 class AxisPlant:
-    """One axis as the current loop sees it.
-
-    Attributes
-    ----------
-    R, L : float
-        Loop resistance (ohm) and incremental inductance (H).
-    T_s : float
-        Control period (s).
-    delay_periods : float
-        Delay from a sample to the mean of the voltage it causes, in periods: 0.5 (hold only) or more.
-    """
+    """One axis as the current loop sees it."""
 
     R: float
     L: float
+    """Loop resistance (ohm) and incremental inductance (H)."""
     T_s: float
+    """Control period (s)."""
     delay_periods: float
+    """Delay from a sample to the mean of the voltage it causes, in periods: 0.5 (hold only) or more."""
 
 
 def modulus_optimum_bandwidth(T_s: float, delay_periods: float) -> float:

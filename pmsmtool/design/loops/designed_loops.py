@@ -178,27 +178,18 @@ _DISC_RADII, _DISC_ANGLES = 12, 48
 
 @dataclass(frozen=True, slots=True)
 class CurrentChoice:
-    """Current loops at one bandwidth.
-
-    Attributes
-    ----------
-    request : TuneRequest
-        What was asked.
-    plants : mapping of str to AxisPlant
-        Axes ``d`` and ``q`` as the gains are designed for.
-    least : mapping of str to float
-        Least inductance of each axis inside the current limit (H); empty for a constant machine.
-    alpha : float
-        Bandwidth (rad/s).
-    why : str
-        How it was chosen, as the end of a sentence.
-    """
+    """Current loops at one bandwidth."""
 
     request: TuneRequest
+    """What was asked."""
     plants: Mapping[str, AxisPlant]
+    """Axes ``d`` and ``q`` as the gains are designed for."""
     least: Mapping[str, float]
+    """Least inductance of each axis inside the current limit (H); empty for a constant machine."""
     alpha: float
+    """Bandwidth (rad/s)."""
     why: str = ""
+    """How it was chosen, as the end of a sentence."""
 
     def gains(self, axis: str) -> CurrentGains:
         """Return the gains of an axis."""

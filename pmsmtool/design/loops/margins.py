@@ -64,24 +64,17 @@ class BlockExecutor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class MarginRequest:
-    """Least margins; None is reported and not judged.
-
-    Attributes
-    ----------
-    phase_margin_deg, gain_margin_db : float
-        Of the current loops, worst corner and fifth percentile.
-    speed_phase_margin_deg : float or None
-        Of the speed loop.
-    voltage_headroom, current_headroom, thermal_headroom : float or None
-        Ratios of the limits.
-    """
+    """Least margins; None is reported and not judged."""
 
     phase_margin_deg: float = 30.0
     gain_margin_db: float = 4.0
+    """Of the current loops, worst corner and fifth percentile."""
     speed_phase_margin_deg: float | None = 30.0
+    """Of the speed loop."""
     voltage_headroom: float | None = None
     current_headroom: float | None = None
     thermal_headroom: float | None = None
+    """Ratios of the limits."""
 
     def least(self, quantity: str) -> float | None:
         """Return what is asked of a quantity by its name."""
@@ -98,33 +91,23 @@ class MarginRequest:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """One quantity over the box.
-
-    Attributes
-    ----------
-    name, unit : str
-        ``current_d_phase`` (deg), ``current_d_gain`` (dB), ``current_d_delay`` (us), likewise q and speed;
-        ``headroom_voltage``, ``headroom_current``, ``headroom_thermal`` (1).
-    nominal, worst : float
-        At the nominal machine, and the least over the corners.
-    worst_sample : mapping of str to float
-        The corner that causes it.
-    worst_cell : str
-        Operating point, for headroom.
-    percentiles : mapping of float to float
-        Of the random samples; empty without.
-    least : float or None
-        What was asked.
-    """
+    """One quantity over the box."""
 
     name: str
     unit: str
+    """``current_d_phase`` (deg), ``current_d_gain`` (dB), ``current_d_delay`` (us), likewise q and speed;
+    ``headroom_voltage``, ``headroom_current``, ``headroom_thermal`` (1)."""
     nominal: float
     worst: float
+    """At the nominal machine, and the least over the corners."""
     worst_sample: Mapping[str, float]
+    """The corner that causes it."""
     worst_cell: str
+    """Operating point, for headroom."""
     percentiles: Mapping[float, float]
+    """Of the random samples; empty without."""
     least: float | None
+    """What was asked."""
 
     @property
     def unjudged(self) -> bool:
@@ -150,29 +133,20 @@ class CellRisk:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class MarginReport(Summarised):
-    """Margins of a design over its box.
-
-    Attributes
-    ----------
-    loops, headroom : tuple of Spread
-        Loop margins; limit headroom.
-    cells : tuple of CellRisk
-        Operating points beyond a limit, over the random samples where there are any, else over the corners.
-    unreachable : tuple of str
-        Operating points up to rated torque that the nominal machine does not reach.
-    corners, samples : int
-        How many were evaluated.
-    notes : tuple of str
-        What was assumed, and each headroom below zero that nobody asked to be judged.
-    """
+    """Margins of a design over its box."""
 
     loops: tuple[Spread, ...]
     headroom: tuple[Spread, ...]
+    """Loop margins; limit headroom."""
     cells: tuple[CellRisk, ...]
+    """Operating points beyond a limit, over the random samples where there are any, else over the corners."""
     unreachable: tuple[str, ...]
+    """Operating points up to rated torque that the nominal machine does not reach."""
     corners: int
     samples: int
+    """How many were evaluated."""
     notes: tuple[str, ...]
+    """What was assumed, and each headroom below zero that nobody asked to be judged."""
 
     def summary(self) -> Summary:
         """Return the margins at the worst corner."""

@@ -59,40 +59,27 @@ class SampledLoop:
 
 @dataclass(frozen=True, slots=True)
 class LoopMargins:
-    """What a loop tolerates.
-
-    Attributes
-    ----------
-    stable : bool
-        Whether all closed-loop poles lie inside the unit circle.
-    phase_margin_deg : float
-        Smallest distance of L from -1 in angle over all gain crossings (degree); infinity without a crossing.
-    gain_margin : float
-        Smallest factor above 1 that makes the loop unstable; infinity when none does.
-    gain_reduction : float
-        Largest factor below 1 that makes the loop unstable; 0 when none does.
-    delay_margin_s : float
-        Phase margin over crossover, the least over all crossings (s): the extra delay that makes the loop unstable,
-        if it acts as exp(-s tau) on L (for a delay in front of the hold see ``current_loop.maximum_delay_periods``).
-    modulus_margin : float
-        Least distance of L from -1; its inverse is the peak of the sensitivity.
-    crossover_rad_s : float
-        Gain crossing at which the phase margin is met (rad/s); NaN without a crossing.
-    bandwidth_rad_s : float
-        Where |L / (1 + L)| first falls below 1/sqrt(2) (rad/s); Nyquist when it does not.
-    delay_s : float
-        Delay the loop already contains (s); ``delay_s + delay_margin_s`` is the largest total delay.
-    """
+    """What a loop tolerates."""
 
     stable: bool
+    """Whether all closed-loop poles lie inside the unit circle."""
     phase_margin_deg: float
+    """Smallest distance of L from -1 in angle over all gain crossings (degree); infinity without a crossing."""
     gain_margin: float
+    """Smallest factor above 1 that makes the loop unstable; infinity when none does."""
     gain_reduction: float
+    """Largest factor below 1 that makes the loop unstable; 0 when none does."""
     delay_margin_s: float
+    """Phase margin over crossover, the least over all crossings (s): the extra delay that makes the loop unstable,
+    if it acts as exp(-s tau) on L (for a delay in front of the hold see ``current_loop.maximum_delay_periods``)."""
     modulus_margin: float
+    """Least distance of L from -1; its inverse is the peak of the sensitivity."""
     crossover_rad_s: float
+    """Gain crossing at which the phase margin is met (rad/s); NaN without a crossing."""
     bandwidth_rad_s: float
+    """Where |L / (1 + L)| first falls below 1/sqrt(2) (rad/s); Nyquist when it does not."""
     delay_s: float
+    """Delay the loop already contains (s); ``delay_s + delay_margin_s`` is the largest total delay."""
 
     @property
     def gain_margin_db(self) -> float:

@@ -66,24 +66,16 @@ class SpeedMethod(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SpeedGains:
-    """Gains of the speed controller, torque over mechanical speed.
-
-    Attributes
-    ----------
-    K_p : float
-        Proportional gain (N m s/rad).
-    K_i : float
-        Integral gain (N m/rad).
-    omega_c : float
-        Crossover (symmetric optimum) or natural frequency (placement) they were designed for (rad/s).
-    method : SpeedMethod
-        Rule that gave them.
-    """
+    """Gains of the speed controller, torque over mechanical speed."""
 
     K_p: float
+    """Proportional gain (N m s/rad)."""
     K_i: float
+    """Integral gain (N m/rad)."""
     omega_c: float
+    """Crossover (symmetric optimum) or natural frequency (placement) they were designed for (rad/s)."""
     method: SpeedMethod
+    """Rule that gave them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,34 +89,23 @@ class Notch:
 
 @dataclass(frozen=True, slots=True)
 class SpeedPath:
-    """Everything between the speed controller's torque and the speed it sees.
-
-    Attributes
-    ----------
-    J, B : float
-        Inertia (kg m2) and viscous friction (N m s).
-    current : SampledLoop
-        Loop of the q axis; its closed form is the torque path.
-    decimation : int
-        Control periods per controller period.
-    pll_rad_s : float
-        Natural frequency of the speed estimate (rad/s).
-    filter_hz : float
-        Cut-off of the first-order feedback filter (Hz).
-    notch : Notch
-        Notch on the torque.
-    shaft : Mechanics or None
-        A load behind an elastic shaft; None: rigid.
-    """
+    """Everything between the speed controller's torque and the speed it sees."""
 
     J: float
     B: float
+    """Inertia (kg m2) and viscous friction (N m s)."""
     current: SampledLoop
+    """Loop of the q axis; its closed form is the torque path."""
     decimation: int
+    """Control periods per controller period."""
     pll_rad_s: float
+    """Natural frequency of the speed estimate (rad/s)."""
     filter_hz: float
+    """Cut-off of the first-order feedback filter (Hz)."""
     notch: Notch = Notch()
+    """Notch on the torque."""
     shaft: Mechanics | None = None
+    """A load behind an elastic shaft; None: rigid."""
 
     @property
     def T_speed(self) -> float:

@@ -82,15 +82,10 @@ _LIVE = {
 
 @dataclass(frozen=True, slots=True)
 class Face:
-    """What a simulated drive shows instead of its own dictionary.
-
-    Attributes
-    ----------
-    drive_map : DriveMap
-        The family.
-    """
+    """What a simulated drive shows instead of its own dictionary."""
 
     drive_map: DriveMap
+    """The family."""
 
     @property
     def vendor_product(self) -> tuple[int, int]:
@@ -157,15 +152,10 @@ class Face:
 
 @dataclass(frozen=True, slots=True)
 class Reduced:
-    """The reference drive without a part of its own objects: what a lower level leaves.
-
-    Attributes
-    ----------
-    level : str
-        Key of :data:`LEVEL_HIDES`.
-    """
+    """The reference drive without a part of its own objects: what a lower level leaves."""
 
     level: str
+    """Key of :data:`LEVEL_HIDES`."""
 
     @property
     def vendor_product(self) -> tuple[int, int]:

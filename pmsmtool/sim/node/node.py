@@ -45,43 +45,29 @@ class Medium(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What distinguishes one drive from another of its kind.
-
-    Attributes
-    ----------
-    node_id : int
-        Node id while LSS has stored none; 255: unconfigured.
-    serial : int
-        Serial number.
-    name : str
-        Device name, object 0x1008.
-    factory : ParameterImage
-        Parameters of a drive that has never stored any.
-    rated_current_ma, rated_torque_mnm : int
-        Factory values of 0x6075 (rms) and 0x6076.
-    fixed_node_id : bool
-        Whether ``node_id`` outranks one stored by LSS (a switch on the drive).
-    face : DriveFace or None
-        What it shows instead of the reference drive's own dictionary.
-    set_point_filter_s : float
-        Time constant of the filter behind its torque slope, 0 without (s).
-    pdo_jitter_s : float
-        How late a process data object is sent at most (s).
-    seed : int
-        Seed of how late they are.
-    """
+    """What distinguishes one drive from another of its kind."""
 
     node_id: int
+    """Node id while LSS has stored none; 255: unconfigured."""
     serial: int
+    """Serial number."""
     name: str
+    """Device name, object 0x1008."""
     factory: ParameterImage
+    """Parameters of a drive that has never stored any."""
     rated_current_ma: int
     rated_torque_mnm: int
+    """Factory values of 0x6075 (rms) and 0x6076."""
     fixed_node_id: bool = False
+    """Whether ``node_id`` outranks one stored by LSS (a switch on the drive)."""
     face: DriveFace | None = None
+    """What it shows instead of the reference drive's own dictionary."""
     set_point_filter_s: float = 0.0
+    """Time constant of the filter behind its torque slope, 0 without (s)."""
     pdo_jitter_s: float = 0.0
+    """How late a process data object is sent at most (s)."""
     seed: int = 0
+    """Seed of how late they are."""
 
 
 class Node:
