@@ -59,49 +59,35 @@ REFERENCE_TABLES = {
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Where and how a drive keeps one value.
-
-    Attributes
-    ----------
-    name : str
-        Catalogue name.
-    index, sub : int
-        The object.
-    wire : str
-        CiA 301 type.
-    factor, offset : float
-        SI value = raw factor + offset.
-    rounding : str
-        ``nearest``, or towards the safe side: ``down``, ``up`` (integers only).
-    gain : str
-        Empty, or the catalogue name of the other value the form needs.
-    unit : str
-        What one count is worth (``drive_maps/wire_units.py``), as in the drive's manual.
-    form : str
-        ``value``; ``time``: the drive keeps gain / value (an integral time T_n = K_p / K_i); ``rate``: value / gain
-        (an integral rate K_i / K_p, a torque slope / rated torque); ``relative``: value / gain of the same unit (a
-        torque / rated torque); ``torque constant``: 1.5 p psi_f instead of the flux linkage (``gain`` is the number of
-        pole pairs); ``current``: value / gain, a torque per something kept as a current (``gain`` is the torque per
-        ampere).
-    source : str
-        Key of ``DriveMap.sources`` that confirms the object.
-    low, high : float
-        Smallest and largest count that the drive takes, where its maker's file says so.
-    """
+    """Where and how a drive keeps one value."""
 
     name: str
+    """Catalogue name."""
     index: int
     sub: int
+    """The object."""
     wire: str
+    """CiA 301 type."""
     factor: float = 1.0
     offset: float = 0.0
+    """SI value = raw factor + offset."""
     rounding: Rounding = "nearest"
+    """``nearest``, or towards the safe side: ``down``, ``up`` (integers only)."""
     gain: str = ""
+    """Empty, or the catalogue name of the other value the form needs."""
     unit: str = ""
+    """What one count is worth (``drive_maps/wire_units.py``), as in the drive's manual."""
     form: Form = "value"
+    """``value``; ``time``: the drive keeps gain / value (an integral time T_n = K_p / K_i); ``rate``: value / gain
+    (an integral rate K_i / K_p, a torque slope / rated torque); ``relative``: value / gain of the same unit (a
+    torque / rated torque); ``torque constant``: 1.5 p psi_f instead of the flux linkage (``gain`` is the number of
+    pole pairs); ``current``: value / gain, a torque per something kept as a current (``gain`` is the torque per
+    ampere)."""
     source: str = ""
+    """Key of ``DriveMap.sources`` that confirms the object."""
     low: float = -math.inf
     high: float = math.inf
+    """Smallest and largest count that the drive takes, where its maker's file says so."""
 
     def __post_init__(self) -> None:
         if self.gain and self.form == "value":
@@ -201,25 +187,17 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class SignalCell:
-    """Where a drive shows or takes a quantity of its running control.
-
-    Attributes
-    ----------
-    index, sub : int
-        The object.
-    wire : str
-        CiA 301 type.
-    unit : str
-        What one count is worth (``drive_maps/wire_units.py``).
-    source : str
-        Key of ``DriveMap.sources``.
-    """
+    """Where a drive shows or takes a quantity of its running control."""
 
     index: int
     sub: int
+    """The object."""
     wire: str
+    """CiA 301 type."""
     unit: str
+    """What one count is worth (``drive_maps/wire_units.py``)."""
     source: str = ""
+    """Key of ``DriveMap.sources``."""
 
     @property
     def size(self) -> int:
@@ -229,89 +207,59 @@ class SignalCell:
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What a family can do besides holding parameters; the drive itself must confirm it.
-
-    Attributes
-    ----------
-    torque_mode : bool or None
-        CiA 402 modes 4 or 10; None: as the drive says (0x6502).
-    velocity_mode : bool
-        CiA 402 modes 3 or 9, of a simulated drive.
-    commutation_angle : bool
-        Mode 11 with the commutation angle 0x60EA.
-    pdo : bool
-        Live quantities as process data.
-    recorder : str
-        ``none``, or how it is read: one of :data:`~pmsmtool.drive_maps.recorder_map.Recording`.
-    injection : str
-        ``none``, ``current`` or ``voltage`` set-points for d and q.
-    averages : bool
-        Window averages inside the drive, and a voltage whose acting period is known.
-    """
+    """What a family can do besides holding parameters; the drive itself must confirm it."""
 
     torque_mode: bool | None = None
+    """CiA 402 modes 4 or 10; None: as the drive says (0x6502)."""
     velocity_mode: bool = False
+    """CiA 402 modes 3 or 9, of a simulated drive."""
     commutation_angle: bool = False
+    """Mode 11 with the commutation angle 0x60EA."""
     pdo: bool = False
+    """Live quantities as process data."""
     recorder: Recording = "none"
+    """``none``, or how it is read: one of :data:`~pmsmtool.drive_maps.recorder_map.Recording`."""
     injection: Injecting = "none"
+    """``none``, ``current`` or ``voltage`` set-points for d and q."""
     averages: bool = False
+    """Window averages inside the drive, and a voltage whose acting period is known."""
 
 
 @dataclass(frozen=True, slots=True)
 class DriveMap:
-    """All cells of one drive family.
-
-    Attributes
-    ----------
-    name : str
-        Family name.
-    vendor, product : int
-        Identity 0x1018:01, 02 a drive must show before anything is written.
-    cells : mapping of str to Cell
-        By catalogue name, in catalogue order.
-    tables : mapping of str to (index, sub)
-        DOMAIN objects of the look-up table; empty where the drive has none.
-    staging : bool
-        Whether the drive takes a whole set at once (objects 0x2000, 0x2001 of the reference drive).
-    more_products : tuple of int
-        Further product codes of the family.
-    capabilities : Capabilities
-        What it can do besides.
-    signals : mapping of str to SignalCell
-        Live quantities and references, by the names of :data:`SIGNALS`.
-    motion : mapping of str to MotionObject
-        The maker's own objects where motion needs what CiA 402 leaves optional.
-    recorder : RecorderMap
-        What its recorder can be told to record, where that is not said by ``signals``.
-    left_out : mapping of str to str
-        What is not mapped and why, by catalogue or signal name.
-    sources : mapping of str to str
-        Where the facts come from.
-    vendor_tuning : VendorTuning or None
-        How the drive's own identification is started and read.
-    identity : IdentityRows
-        What beyond vendor and product tells whether a drive is the map's.
-    whole : DriveMap or None
-        The map of the file, where this one is without rows that a drive lacks.
-    """
+    """All cells of one drive family."""
 
     name: str
+    """Family name."""
     vendor: int
     product: int
+    """Identity 0x1018:01, 02 a drive must show before anything is written."""
     cells: Mapping[str, Cell]
+    """By catalogue name, in catalogue order."""
     tables: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    """DOMAIN objects of the look-up table; empty where the drive has none. Mapping of str to (index, sub)."""
     staging: bool = False
+    """Whether the drive takes a whole set at once (objects 0x2000, 0x2001 of the reference drive)."""
     more_products: tuple[int, ...] = ()
+    """Further product codes of the family."""
     capabilities: Capabilities = Capabilities()
+    """What it can do besides."""
     signals: Mapping[str, SignalCell] = field(default_factory=dict)
+    """Live quantities and references, by the names of :data:`SIGNALS`."""
     motion: Mapping[str, MotionObject] = field(default_factory=dict)
+    """The maker's own objects where motion needs what CiA 402 leaves optional."""
     recorder: RecorderMap = field(default_factory=RecorderMap)
+    """What its recorder can be told to record, where that is not said by ``signals``."""
     left_out: Mapping[str, str] = field(default_factory=dict)
+    """What is not mapped and why, by catalogue or signal name."""
     sources: Mapping[str, str] = field(default_factory=dict)
+    """Where the facts come from."""
     vendor_tuning: VendorTuning | None = None
+    """How the drive's own identification is started and read."""
     identity: IdentityRows = field(default_factory=IdentityRows)
+    """What beyond vendor and product tells whether a drive is the map's."""
     whole: DriveMap | None = None
+    """The map of the file, where this one is without rows that a drive lacks."""
 
     @property
     def signature(self) -> int:

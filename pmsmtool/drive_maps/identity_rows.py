@@ -22,27 +22,19 @@ Complain = Callable[[tuple[str, ...], str], None]
 
 @dataclass(frozen=True, slots=True)
 class IdentityRows:
-    """What else identifies a drive of the family.
-
-    Attributes
-    ----------
-    serial : tuple of int
-        Index, sub-index and size in bytes of the serial number where 0x1018:04 is absent or 0; empty: nowhere else.
-    revisions : tuple of int
-        Major revisions (upper half of 0x1018:03) of the files the map was taken from; empty: they do not say.
-    names : tuple of str
-        Words of the device name (0x1008) by which a maker is known that shares its vendor number.
-    marks : tuple of (index, sub, size)
-        Objects by which it is known where the name does not tell; with neither, the vendor number is the maker's alone.
-    source : str
-        Key of ``DriveMap.sources``.
-    """
+    """What else identifies a drive of the family."""
 
     serial: tuple[int, int, int] | None = None
+    """Index, sub-index and size in bytes of the serial number where 0x1018:04 is absent or 0; empty: nowhere else."""
     revisions: tuple[int, ...] = ()
+    """Major revisions (upper half of 0x1018:03) of the files the map was taken from; empty: they do not say."""
     names: tuple[str, ...] = ()
+    """Words of the device name (0x1008) by which a maker is known that shares its vendor number."""
     marks: tuple[tuple[int, int, int], ...] = ()
+    """Objects by which it is known where the name does not tell; with neither, the vendor number is the maker's alone.
+    Tuple of (index, sub, size)."""
     source: str = ""
+    """Key of ``DriveMap.sources``."""
 
     @property
     def shared(self) -> bool:

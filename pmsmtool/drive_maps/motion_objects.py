@@ -38,25 +38,18 @@ CheckObject = Callable[[Any, tuple[str, ...], Complain], bool]
 
 @dataclass(frozen=True, slots=True)
 class MotionObject:
-    """Where a drive keeps, shows or takes one of :data:`DIMENSIONS`.
-
-    Attributes
-    ----------
-    index, sub, wire, unit, source
-        As of a signal of the map; ``index`` 0 where the maker fixes the ``number``.
-    mode : int
-        Mode of operation in which a target acts; 0: none is needed.
-    number : float
-        The value itself where no object holds it; 0: an object does.
-    """
+    """Where a drive keeps, shows or takes one of :data:`DIMENSIONS`."""
 
     index: int = 0
     sub: int = 0
     wire: str = "UNSIGNED32"
     unit: str = "1"
     source: str = ""
+    """As of a signal of the map; ``index`` 0 where the maker fixes the ``number``."""
     mode: int = 0
+    """Mode of operation in which a target acts; 0: none is needed."""
     number: float = 0.0
+    """The value itself where no object holds it; 0: an object does."""
 
     @property
     def undecided(self) -> bool:

@@ -39,45 +39,30 @@ Address = tuple[int, int, str]
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A signal that a recorder can take.
-
-    Attributes
-    ----------
-    unit : str
-        What one recorded count is worth (``drive_maps/wire_units.py``).
-    number : int
-        Number of the trace variable; 0 where the recorder takes objects.
-    index, sub, wire : int, int, str
-        The object and its CiA 301 type; empty where the recorder takes numbers.
-    source : str
-        Key of ``DriveMap.sources``.
-    """
+    """A signal that a recorder can take."""
 
     unit: str
+    """What one recorded count is worth (``drive_maps/wire_units.py``)."""
     number: int = 0
+    """Number of the trace variable; 0 where the recorder takes objects."""
     index: int = 0
     sub: int = 0
     wire: str = ""
+    """The object and its CiA 301 type; empty where the recorder takes numbers."""
     source: str = ""
+    """Key of ``DriveMap.sources``."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderMap:
-    """The table ``[recorder]``.
-
-    Attributes
-    ----------
-    channels : mapping of str to Channel
-        By the names of ``drive_map.SIGNALS``.
-    period : str
-        What one count of the recorder's period is worth, where the drive itself does not say it; empty: not known.
-    period_source : str
-        Key of ``DriveMap.sources``.
-    """
+    """The table ``[recorder]``."""
 
     channels: Mapping[str, Channel] = field(default_factory=dict)
+    """By the names of ``drive_map.SIGNALS``."""
     period: str = ""
+    """What one count of the recorder's period is worth, where the drive itself does not say it; empty: not known."""
     period_source: str = ""
+    """Key of ``DriveMap.sources``."""
 
 
 def dump_recorder(recorder: RecorderMap) -> dict[str, Any]:

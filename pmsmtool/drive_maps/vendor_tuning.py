@@ -57,33 +57,22 @@ ParseCell = Callable[[str, Any, tuple[str, ...]], "Cell | None"]
 
 @dataclass(frozen=True, slots=True)
 class VendorStep:
-    """One measurement of the drive's own.
-
-    Attributes
-    ----------
-    name : str
-        Catalogue name of its result, or what it checks.
-    timeout_s : float
-        Longest time it may take (s).
-    turns : bool
-        Whether the shaft must be free to turn.
-    moves : str
-        What it does to the machine, as a person reads it before consenting.
-    command : int
-        Its number as OS command.
-    uses : tuple of str
-        Catalogue names of results the drive works with: written into it before, as far as they were measured.
-    failures : mapping of int to str
-        Its own error codes.
-    """
+    """One measurement of the drive's own."""
 
     name: str
+    """Catalogue name of its result, or what it checks."""
     timeout_s: float
+    """Longest time it may take (s)."""
     turns: bool
+    """Whether the shaft must be free to turn."""
     moves: str
+    """What it does to the machine, as a person reads it before consenting."""
     command: int
+    """Its number as OS command."""
     uses: tuple[str, ...] = ()
+    """Catalogue names of results the drive works with: written into it before, as far as they were measured."""
     failures: Mapping[int, str] = field(default_factory=dict)
+    """Its own error codes."""
 
     @property
     def title(self) -> str:
@@ -93,30 +82,20 @@ class VendorStep:
 
 @dataclass(frozen=True, slots=True)
 class VendorTuning:
-    """The drive's own identification.
-
-    Attributes
-    ----------
-    mode : int
-        Mode of operation in which the drive is enabled for it.
-    steps : mapping of str to VendorStep
-        In the order in which they run.
-    results : mapping of str to Cell
-        By catalogue name: how the answer's data are read.
-    order : str
-        Byte order of the data in an answer.
-    failures : mapping of int to str
-        Error codes that every OS command may answer.
-    source : str
-        Key of ``DriveMap.sources``.
-    """
+    """The drive's own identification."""
 
     mode: int
+    """Mode of operation in which the drive is enabled for it."""
     steps: Mapping[str, VendorStep]
+    """In the order in which they run."""
     results: Mapping[str, Cell]
+    """By catalogue name: how the answer's data are read."""
     order: str = "little"
+    """Byte order of the data in an answer."""
     failures: Mapping[int, str] = field(default_factory=dict)
+    """Error codes that every OS command may answer."""
     source: str = ""
+    """Key of ``DriveMap.sources``."""
 
     @property
     def quantities(self) -> frozenset[str]:
@@ -135,27 +114,18 @@ class VendorTuning:
 
 @dataclass(frozen=True, slots=True)
 class VendorAnswer:
-    """What a drive answered to one step.
-
-    Attributes
-    ----------
-    step : str
-        Name of the step.
-    data : bytes
-        Bytes of its answer as they came, the status in front.
-    seconds : float
-        Time it took (s).
-    values : dict of str to float
-        Results by catalogue name, SI.
-    relative_to : dict of str to float
-        What they were counted relative to.
-    """
+    """What a drive answered to one step."""
 
     step: str
+    """Name of the step."""
     data: bytes
+    """Bytes of its answer as they came, the status in front."""
     seconds: float
+    """Time it took (s)."""
     values: dict[str, float]
+    """Results by catalogue name, SI."""
     relative_to: dict[str, float]
+    """What they were counted relative to."""
 
 
 # ---- the table of a map file ------------------------------------------------------------------------

@@ -19,21 +19,14 @@ from pmsmtool.units import PREFIXES, UNITS
 
 @dataclass(frozen=True, slots=True)
 class WireUnit:
-    """What one count is worth.
-
-    Attributes
-    ----------
-    dimension : str
-        What is counted, as in ``units.UNITS``.
-    scale : float
-        SI value (base unit of the dimension) of one count.
-    relative_to : int
-        Index of the object that holds the base of a permille value, 0 for absolute units.
-    """
+    """What one count is worth."""
 
     dimension: str
+    """What is counted, as in ``units.UNITS``."""
     scale: float
+    """SI value (base unit of the dimension) of one count."""
     relative_to: int = 0
+    """Index of the object that holds the base of a permille value, 0 for absolute units."""
 
 
 _COMPOSITE: dict[str, tuple[str, float]] = {

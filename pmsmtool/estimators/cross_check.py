@@ -42,23 +42,16 @@ JUDGES = 0.3
 
 @dataclass(frozen=True, slots=True)
 class CrossCheck:
-    """What a second method says about a quantity.
-
-    Attributes
-    ----------
-    name, of : str
-        Key of the check's own estimate, and of the quantity it checks.
-    estimate : Estimate
-        The second method's value.
-    difference, half_width : float
-        Second less first method, and its 95 % half width without what both have in common, of the first's value.
-    """
+    """What a second method says about a quantity."""
 
     name: str
     of: str
+    """Key of the check's own estimate, and of the quantity it checks."""
     estimate: Estimate
+    """The second method's value."""
     difference: float
     half_width: float
+    """Second less first method, and its 95 % half width without what both have in common, of the first's value."""
 
     @property
     def agrees(self) -> bool:

@@ -34,19 +34,13 @@ that rang at 0.44 of its rate made the noise eight times too large, which hid ed
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """White noise of one axis current.
-
-    Attributes
-    ----------
-    sigma_a : float
-        Standard deviation of one sample of i_d or i_q (A).
-    offset_d_a, offset_q_a : float
-        Mean of the zero-current trace (A).
-    """
+    """White noise of one axis current."""
 
     sigma_a: float
+    """Standard deviation of one sample of i_d or i_q (A)."""
     offset_d_a: float
     offset_q_a: float
+    """Mean of the zero-current trace (A)."""
 
 
 def estimate_noise(trace: Trace) -> Noise:

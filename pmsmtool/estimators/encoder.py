@@ -53,27 +53,18 @@ OTHER_WORSE = 3.0
 
 @dataclass(frozen=True, slots=True)
 class EncoderResult:
-    """Pole pairs, direction and coarse offset.
-
-    Attributes
-    ----------
-    pole_pairs : Estimate
-        Integer value; ``std`` is the distance of the two runs from it.
-    direction : int
-        +1 when the encoder counts with the electrical angle, -1 against it.
-    offset : Estimate
-        Offset in theta_e = direction p theta_M - offset (rad electrical), within (-pi, pi].
-    lag_rad : float
-        Half the difference between forward and backward run: what friction holds back (rad electrical).
-    per_turn : tuple of Harmonic
-        What the rotation shows of the encoder's error once and twice per turn (rad mechanical), along the phase order.
-    """
+    """Pole pairs, direction and coarse offset."""
 
     pole_pairs: Estimate
+    """Integer value; ``std`` is the distance of the two runs from it."""
     direction: int
+    """+1 when the encoder counts with the electrical angle, -1 against it."""
     offset: Estimate
+    """Offset in theta_e = direction p theta_M - offset (rad electrical), within (-pi, pi]."""
     lag_rad: float
+    """Half the difference between forward and backward run: what friction holds back (rad electrical)."""
     per_turn: tuple[Harmonic, ...] = ()
+    """What the rotation shows of the encoder's error once and twice per turn (rad, mechanical), by the phase order."""
 
     @property
     def per_turn_rad(self) -> tuple[float, ...]:

@@ -48,42 +48,30 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class SensorTolerance:
-    """Declared tolerances that no experiment on the machine itself can see (95 % half widths).
-
-    Attributes
-    ----------
-    current_gain, voltage_gain : float
-        Relative scale errors of the current measurement and of the DC-link measurement.
-    temperature_k : float
-        Error of the temperature sensor (K).
-    device_share_max : float
-        Largest part of the loop resistance that devices and shunts may have when the split is unknown (1).
-    bridge_threshold_v, U_dc_v : float
-        Standard deviation of diode minus switch threshold (V; 0 for a bridge of MOSFETs) and the DC link it acts on: a
-        conducting leg swings by U_dc + V_diode - V_switch, which no experiment tells from a voltage gain. It is a model
-        error that differs from drive to drive, so it belongs to the statistical part. Infinite link: not counted.
-    encoder_latency_s : float
-        Age of the encoder's angle at the period's start (s): looks like a late current sample.
-    magnet_per_k : float
-        Error of the magnets' temperature coefficient (1/K): what a flux linkage at the reference temperature has from
-        an assumed one.
-    current_scale, voltage_scale : float
-        True over shown, where an instrument said so; the gains are then the instrument's tolerances.
-    bridge_difference_v : float or None
-        Diode minus switch threshold, where the devices' data sheet said so (V); the standard deviation is then its.
-    """
+    """Declared tolerances that no experiment on the machine itself can see (95 % half widths)."""
 
     current_gain: float = SENSOR_GAIN_TOLERANCE
     voltage_gain: float = SENSOR_GAIN_TOLERANCE
+    """Relative scale errors of the current measurement and of the DC-link measurement."""
     temperature_k: float = 2.0
+    """Error of the temperature sensor (K)."""
     device_share_max: float = 0.3
+    """Largest part of the loop resistance that devices and shunts may have when the split is unknown (1)."""
     bridge_threshold_v: float = BRIDGE_THRESHOLD_V
     U_dc_v: float = math.inf
+    """Standard deviation of diode minus switch threshold (V; 0 for a bridge of MOSFETs) and the DC link it acts on: a
+    conducting leg swings by U_dc + V_diode - V_switch, which no experiment tells from a voltage gain. It is a model
+    error that differs from drive to drive, so it belongs to the statistical part. Infinite link: not counted."""
     encoder_latency_s: float = ENCODER_LATENCY_S
+    """Age of the encoder's angle at the period's start (s): looks like a late current sample."""
     current_scale: float = 1.0
     voltage_scale: float = 1.0
+    """True over shown, where an instrument said so; the gains are then the instrument's tolerances."""
     bridge_difference_v: float | None = None
+    """Diode minus switch threshold, where the devices' data sheet said so (V); the standard deviation is then its."""
     magnet_per_k: float = 0.0
+    """Error of the magnets' temperature coefficient (1/K): what a flux linkage at the reference temperature has from
+    an assumed one."""
 
     @property
     def applied_scale(self) -> float:

@@ -38,21 +38,14 @@ SAME_LEVEL = 1.1
 
 @dataclass(frozen=True, slots=True)
 class InverterCurve:
-    """Voltage error of one phase, odd in its current.
-
-    Attributes
-    ----------
-    i_phase_a : ndarray, shape (n,)
-        Phase current, increasing and positive (A).
-    u_error_v : ndarray, shape (n,)
-        Command minus terminal voltage beyond R i, mean of both signs (V).
-    asymmetry_v : float
-        Largest difference between the signs (V).
-    """
+    """Voltage error of one phase, odd in its current."""
 
     i_phase_a: Array
+    """Phase current, increasing and positive (A). Shape (n,)."""
     u_error_v: Array
+    """Command minus terminal voltage beyond R i, mean of both signs (V). Shape (n,)."""
     asymmetry_v: float
+    """Largest difference between the signs (V)."""
 
     def error_v(self, i_phase_a: Array) -> Array:
         """Error at any phase current: linear between the points and through zero, constant beyond the last (V)."""
@@ -153,24 +146,16 @@ LEAST_CHARGE = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Modulation:
-    """What the ripple depends on besides the voltage.
-
-    Attributes
-    ----------
-    U_dc_v : float
-        DC link (V).
-    L_h : (float, float)
-        Inductances of the machine at the switching frequency, d and q (H).
-    period_s : float
-        Switching period (s).
-    dead_time_s : float
-        From the plateau of the measured curve: V_dead T_s/U_dc (s).
-    """
+    """What the ripple depends on besides the voltage."""
 
     U_dc_v: float
+    """DC link (V)."""
     L_h: tuple[float, float]
+    """Inductances of the machine at the switching frequency, d and q (H)."""
     period_s: float
+    """Switching period (s)."""
     dead_time_s: float
+    """From the plateau of the measured curve: V_dead T_s/U_dc (s)."""
 
     @property
     def plateau_v(self) -> float:

@@ -25,27 +25,18 @@ DAMPING_START, DAMPING_LIMIT = 1e-3, 1e12
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """Result of a non-linear least-squares fit.
-
-    Attributes
-    ----------
-    x : ndarray, shape (k,)
-        Parameters.
-    residual : ndarray, shape (n,)
-        Whitened residual at ``x``.
-    jacobian : ndarray, shape (n, k)
-        Its derivative.
-    converged : bool
-        Whether the last step was small.
-    iterations : int
-        Accepted and rejected steps.
-    """
+    """Result of a non-linear least-squares fit."""
 
     x: Array
+    """Parameters. Shape (k,)."""
     residual: Array
+    """Whitened residual at ``x``. Shape (n,)."""
     jacobian: NDArray[np.float64]
+    """Its derivative. Shape (n, k)."""
     converged: bool
+    """Whether the last step was small."""
     iterations: int
+    """Accepted and rejected steps."""
 
     @property
     def cost(self) -> float:

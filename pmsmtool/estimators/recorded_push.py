@@ -53,24 +53,17 @@ METHOD = "regression over recorded torque pulses"
 
 @dataclass(frozen=True, slots=True)
 class PushResult:
-    """What the pushes tell.
-
-    Attributes
-    ----------
-    R : Estimate or None
-        Loop resistance at the temperature of the run. None when the inverter's error hides it.
-    psi_f, L_q, frame_offset : Estimate
-        Flux linkage at the temperature of the run, apparent L_q at the pushes' currents, angle of the frame ahead of
-        the d axis (rad electrical).
-    V_dead_v : float
-        Voltage that changes sign with the current (V).
-    """
+    """What the pushes tell."""
 
     R: Estimate | None
+    """Loop resistance at the temperature of the run. None when the inverter's error hides it."""
     psi_f: Estimate
     L_q: Estimate
     frame_offset: Estimate
+    """Flux linkage at the temperature of the run, apparent L_q at the pushes' currents, angle of the frame ahead of
+    the d axis (rad electrical)."""
     V_dead_v: float
+    """Voltage that changes sign with the current (V)."""
 
 
 def estimate_pushes(

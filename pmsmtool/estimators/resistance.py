@@ -120,24 +120,16 @@ HARD_FACTOR = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Copper:
-    """What is known of the winding's temperature coefficient.
-
-    Attributes
-    ----------
-    T_ref_c : float
-        Temperature R_s is normalised to (degC).
-    alpha_per_k : float
-        Temperature coefficient of the copper part (1/K).
-    R_winding_ohm : float or None
-        The copper part of the loop at ``T_ref_c``, where a meter or a data sheet gave it (ohm).
-    winding_half_ohm : float
-        Its 95 % half width (ohm).
-    """
+    """What is known of the winding's temperature coefficient."""
 
     T_ref_c: float = 20.0
+    """Temperature R_s is normalised to (degC)."""
     alpha_per_k: float = COPPER_ALPHA_PER_K
+    """Temperature coefficient of the copper part (1/K)."""
     R_winding_ohm: float | None = None
+    """The copper part of the loop at ``T_ref_c``, where a meter or a data sheet gave it (ohm)."""
     winding_half_ohm: float = 0.0
+    """Its 95 % half width (ohm)."""
 
 
 def copper_of(file: MachineFile) -> Copper:
@@ -151,33 +143,22 @@ def copper_of(file: MachineFile) -> Copper:
 
 @dataclass(frozen=True, slots=True)
 class ResistanceResult:
-    """Loop resistance and inverter error.
-
-    Attributes
-    ----------
-    R_s : Estimate
-        Loop resistance at the reference temperature (ohm); ``T_c`` is the temperature it was measured at.
-    R_measured : Estimate
-        Loop resistance at the temperature of the measurement (ohm).
-    curve : InverterCurve
-        Voltage error of one phase against its current.
-    V_dead_v : float
-        Plateau of that error, without the device slope that R contains (V).
-    drift : float
-        Relative change of R over the sweep that the temperature reading does not explain.
-    verdict : Verdict
-        ``warn`` when the fit is above its chi-square limit.
-    copper : Copper
-        What R is taken to another temperature by.
-    """
+    """Loop resistance and inverter error."""
 
     R_s: Estimate
+    """Loop resistance at the reference temperature (ohm); ``T_c`` is the temperature it was measured at."""
     R_measured: Estimate
+    """Loop resistance at the temperature of the measurement (ohm)."""
     curve: InverterCurve
+    """Voltage error of one phase against its current."""
     V_dead_v: float
+    """Plateau of that error, without the device slope that R contains (V)."""
     drift: float
+    """Relative change of R over the sweep that the temperature reading does not explain."""
     verdict: Verdict
+    """``warn`` when the fit is above its chi-square limit."""
     copper: Copper = Copper()
+    """What R is taken to another temperature by."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -73,28 +73,19 @@ Rows = NDArray[np.complexfloating[Any, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """One guess at the inverter's error, and whether the machine is taken as linear.
-
-    Attributes
-    ----------
-    along : tuple of int
-        Powers of 1/abs(i) in V.
-    across : tuple of int
-        Powers of 1/abs(i) in h, each with its own function of the speed.
-    crossing : tuple of float
-        Parts of h that follow the slope s at which a phase current passes zero, s/(1 + s^2), s over these shares of the
-        largest speed times the largest current.
-    linear : bool
-        One inductance per axis for speed and slope.
-    turned : bool
-        The frame may be off by an angle in proportion to the speed.
-    """
+    """One guess at the inverter's error, and whether the machine is taken as linear."""
 
     along: tuple[int, ...]
+    """Powers of 1/abs(i) in V."""
     across: tuple[int, ...]
+    """Powers of 1/abs(i) in h, each with its own function of the speed."""
     crossing: tuple[float, ...] = ()
+    """Parts of h that follow the slope s at which a phase current passes zero, s/(1 + s^2), s over these shares of the
+    largest speed times the largest current."""
     linear: bool = False
+    """One inductance per axis for speed and slope."""
     turned: bool = False
+    """The frame may be off by an angle in proportion to the speed."""
 
 
 SHAPES = (
@@ -109,32 +100,22 @@ SHAPES = (
 
 @dataclass(frozen=True, slots=True)
 class Blocks:
-    """Rows of one push; shapes (n,).
-
-    Attributes
-    ----------
-    w : ndarray
-        Electrical speed at the middle of the voltage (rad/s).
-    i, slope, u : ndarray of complex
-        Current there (A), its slope (A/s) and the voltage (V), d + j q.
-    weight : ndarray
-        1, less where harmonics of the inverter do not average out.
-    rate : float
-        Size of the electrical acceleration (rad/s2).
-    lag : float
-        Mean of the drive's own speed less the rotor's (rad/s).
-    i_q : float
-        Mean torque current (A).
-    """
+    """Rows of one push; shapes (n,)."""
 
     w: Array
+    """Electrical speed at the middle of the voltage (rad/s)."""
     i: Rows
     slope: Rows
     u: Rows
+    """Current there (A), its slope (A/s) and the voltage (V), d + j q."""
     weight: Array
+    """1, less where harmonics of the inverter do not average out."""
     rate: float
+    """Size of the electrical acceleration (rad/s2)."""
     lag: float
+    """Mean of the drive's own speed less the rotor's (rad/s)."""
     i_q: float
+    """Mean torque current (A)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,34 +60,24 @@ _ALPHA, _BETA, _KAPPA = 0.5, 2.0, 0.0
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """What was followed.
-
-    Attributes
-    ----------
-    t_s : ndarray, shape (n,)
-        Instants of the observations.
-    value, std : mapping of str to ndarray, shape (n,)
-        By name of ``tracking_model.TRACKED``; the standard deviation contains the inflation and :data:`FLOOR`.
-    nis : float
-        Mean normalised innovation squared, before an inflation.
-    inflation : float
-        Factor on the noise's variance; 1: none was needed.
-    noise_v : tuple of float
-        Standard deviation of one observation of u_d and u_q (V), inflated.
-    restarts : int
-        How often the filter lost its covariance and began again.
-    notes : tuple of str
-        What a reader should know.
-    """
+    """What was followed."""
 
     t_s: Array
+    """Instants of the observations. Shape (n,)."""
     value: Mapping[str, Array]
     std: Mapping[str, Array]
+    """By name of ``tracking_model.TRACKED``; the standard deviation contains the inflation and :data:`FLOOR`.
+    Shape (n,)."""
     nis: float
+    """Mean normalised innovation squared, before an inflation."""
     inflation: float
+    """Factor on the noise's variance; 1: none was needed."""
     noise_v: tuple[float, float]
+    """Standard deviation of one observation of u_d and u_q (V), inflated."""
     restarts: int = 0
+    """How often the filter lost its covariance and began again."""
     notes: tuple[str, ...] = field(default=())
+    """What a reader should know."""
 
 
 # ---- the filter -----------------------------------------------------------------------------------------------

@@ -55,31 +55,22 @@ ACROSS, ALONG = 12.0 / 35.0, 2.0 / 35.0
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What is known of the machine before.
-
-    Attributes
-    ----------
-    R_s_ohm, psi_f_wb, L_d_h, L_q_h : float
-        Values to start from; inductances are apparent ones.
-    L_std : tuple of float
-        Relative standard deviations of the inductances.
-    T_s : float
-        Control period (s).
-    curve : InverterCurve or None
-        Error of one phase.
-    error_share : tuple of float
-        Mean and standard deviation of the part of the curve that the recorded voltage contains: (1, 0.1) without
-        a compensation, (0, 0.2) when the drive compensates it.
-    """
+    """What is known of the machine before."""
 
     R_s_ohm: float
     psi_f_wb: float
     L_d_h: float
     L_q_h: float
+    """Values to start from; inductances are apparent ones."""
     T_s: float
+    """Control period (s)."""
     L_std: tuple[float, float] = (INDUCTANCE_STD, INDUCTANCE_STD)
+    """Relative standard deviations of the inductances."""
     curve: InverterCurve | None = None
+    """Error of one phase."""
     error_share: tuple[float, float] = (1.0, 0.1)
+    """Mean and standard deviation of the part of the curve that the recorded voltage contains: (1, 0.1) without
+    a compensation, (0, 0.2) when the drive compensates it."""
 
     @property
     def scale(self) -> Array:

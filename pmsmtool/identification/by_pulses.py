@@ -100,69 +100,46 @@ def current_share(pushes: Sequence[Trace]) -> float:
 
 @dataclass(frozen=True, slots=True)
 class PulseResult:
-    """Estimates of a run without injection.
-
-    Attributes
-    ----------
-    estimates : mapping of str to Estimate
-        By the keys of a machine file.
-    missing : mapping of str to str
-        What was asked and cannot be told, with the reason.
-    """
+    """Estimates of a run without injection."""
 
     estimates: Mapping[str, Estimate]
+    """By the keys of a machine file."""
     missing: Mapping[str, str]
+    """What was asked and cannot be told, with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class PulseFacts:
-    """What a run without injection was, besides its traces.
-
-    Attributes
-    ----------
-    kind : str
-        ``recorder``: recorded pushes; ``standard``: a turned vector, polled pushes.
-    period_s : float
-        Control period of a recorder (s).
-    pole_pairs : int
-        As given, or as the drive's set says; 0 where only the turned vector tells them.
-    T_winding_c, T_magnet_c : float or None
-        What the drive showed (degC).
-    pushed : bool
-        Whether the shaft was pushed by torque.
-    voltage : str
-        What ``psi_f`` is told by: the ``machine`` voltage, the DC ``link`` at the limit, or neither.
-    top_rpm, U_dc_v : float
-        Speed no run-up goes beyond, and the DC link as the drive shows it.
-    source : str
-        Where what completes the values comes from (``nameplate.toml``); empty: nothing does.
-    traces : tuple of str
-        Names of the traces in the order they were taken.
-    current_undecided : bool
-        Whether no source says if the drive's amperes are peak or rms; they were read as rms.
-    limit : str
-        What is said of a current limit that was not proven.
-    no_vector : str
-        Why no vector was turned, where the drive announces that it can be.
-    no_push : str
-        Why the pushes told nothing, where something else was measured.
-    """
+    """What a run without injection was, besides its traces."""
 
     kind: Method
+    """``recorder``: recorded pushes; ``standard``: a turned vector, polled pushes."""
     period_s: float = 0.0
+    """Control period of a recorder (s)."""
     pole_pairs: int = 0
+    """As given, or as the drive's set says; 0 where only the turned vector tells them."""
     T_winding_c: float | None = None
     T_magnet_c: float | None = None
+    """What the drive showed (degC)."""
     pushed: bool = False
+    """Whether the shaft was pushed by torque."""
     voltage: Voltage = ""
+    """What ``psi_f`` is told by: the ``machine`` voltage, the DC ``link`` at the limit, or neither."""
     top_rpm: float = 0.0
     U_dc_v: float = 0.0
+    """Speed no run-up goes beyond, and the DC link as the drive shows it."""
     source: str = ""
+    """Where what completes the values comes from (``nameplate.toml``); empty: nothing does."""
     traces: tuple[str, ...] = ()
+    """Names of the traces in the order they were taken."""
     current_undecided: bool = False
+    """Whether no source says if the drive's amperes are peak or rms; they were read as rms."""
     limit: str = ""
+    """What is said of a current limit that was not proven."""
     no_vector: str = ""
+    """Why no vector was turned, where the drive announces that it can be."""
     no_push: str = ""
+    """Why the pushes told nothing, where something else was measured."""
 
 
 def pulse_result(

@@ -36,24 +36,17 @@ TREND = 2.576
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One quantity in two runs.
-
-    Attributes
-    ----------
-    name, unit : str
-        As in the machine file.
-    first, second : float or None
-        Values; None where the run did not accept one.
-    difference, interval : float
-        Second minus first, and its 95 % half width; NaN where one is missing.
-    """
+    """One quantity in two runs."""
 
     name: str
     unit: str
+    """As in the machine file."""
     first: float | None
     second: float | None
+    """Values; None where the run did not accept one."""
     difference: float
     interval: float
+    """Second minus first, and its 95 % half width; NaN where one is missing."""
 
     @property
     def verdict(self) -> str:
@@ -161,33 +154,23 @@ def told(row: Difference) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """One quantity over many runs.
-
-    Attributes
-    ----------
-    name, unit : str
-        As in the machine file.
-    runs : int
-        In how many it was accepted.
-    median, spread : float
-        Median, and robust standard deviation (NaN below ``LEAST_SERIES`` runs).
-    interval : float
-        Median total 95 % half width of one run.
-    odd : tuple of str
-        Runs whose value stands out of the others by more than the series' spread and its own interval.
-    drift : float
-        Change from the first run to the last by the median slope, where Mann and Kendall's test sees one at 99 %; NaN
-        where it sees none, which it cannot below 7 runs.
-    """
+    """One quantity over many runs."""
 
     name: str
     unit: str
+    """As in the machine file."""
     runs: int
+    """In how many it was accepted."""
     median: float
     spread: float
+    """Median, and robust standard deviation (NaN below ``LEAST_SERIES`` runs)."""
     interval: float
+    """Median total 95 % half width of one run."""
     odd: tuple[str, ...] = ()
+    """Runs whose value stands out of the others by more than the series' spread and its own interval."""
     drift: float = math.nan
+    """Change from the first run to the last by the median slope, where Mann and Kendall's test sees one at 99 %; NaN
+    where it sees none, which it cannot below 7 runs."""
 
 
 def measured(estimates: Mapping[str, Estimate]) -> dict[str, Estimate]:

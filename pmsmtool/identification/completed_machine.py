@@ -30,21 +30,14 @@ PER_PSI = {"J_per_psi": "J_kgm2", "tau_c_per_psi": "tau_c_nm"}
 
 @dataclass(frozen=True, slots=True)
 class CompletedMachine:
-    """What is known of a machine after an identification without injection.
-
-    Attributes
-    ----------
-    machine : MachineFile or None
-        None when values are lacking.
-    given : tuple of str
-        Keys whose values were not measured.
-    notes : tuple of str
-        What was done to the values.
-    """
+    """What is known of a machine after an identification without injection."""
 
     machine: MachineFile | None
+    """None when values are lacking."""
     given: tuple[str, ...]
+    """Keys whose values were not measured."""
     notes: tuple[str, ...] = ()
+    """What was done to the values."""
 
     def given_values(self, source: str) -> list[Mapping[str, Any]]:
         """Return what was given as a stage records it: with its source, without an interval of ours."""

@@ -32,68 +32,45 @@ RESISTANCES = (0.3, 4.0)
 
 @dataclass(frozen=True, slots=True)
 class CurrentSteps:
-    """One record, a row per period of the loop.
-
-    Attributes
-    ----------
-    period_s : float
-        Of the rows, and of the loop.
-    asked_a, current_a, output : ndarray
-        Asked and flowing q current (A), and the loop's output (counts).
-    """
+    """One record, a row per period of the loop."""
 
     period_s: float
+    """Of the rows, and of the loop."""
     asked_a: Array
     current_a: Array
     output: Array
+    """Asked and flowing q current (A), and the loop's output (counts)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Winding:
-    """What the loop acts on.
-
-    Attributes
-    ----------
-    L_h, L_std : float
-        Inductance in q, and its standard deviation (relative).
-    R_ohm : float
-        Resistance, from which a fit begins.
-    """
+    """What the loop acts on."""
 
     L_h: float
     L_std: float
+    """Inductance in q, and its standard deviation (relative)."""
     R_ohm: float
+    """Resistance, from which a fit begins."""
 
 
 @dataclass(frozen=True, slots=True)
 class CurrentLoop:
-    """What records of one setting say.
-
-    Attributes
-    ----------
-    K_p_per_L : float
-        Gain over the inductance (1/s).
-    rate_per_s : float
-        K_i / K_p.
-    delay : float
-        Periods; one of :data:`DELAYS`.
-    misfit : float
-        Root mean square of what the loop leaves of the current, over that of what it moves.
-    output_misfit : float
-        The same of the loop's output: what is no PI of the error.
-    corner : float
-        R / L (1/s) as it follows: of the warm winding, with what the inverter adds.
-    std : tuple of float
-        Of K_p, K_i and K_i / K_p (relative), by what single records differ in.
-    """
+    """What records of one setting say."""
 
     K_p_per_L: float
+    """Gain over the inductance (1/s)."""
     rate_per_s: float
+    """K_i / K_p."""
     delay: float
+    """Periods; one of :data:`DELAYS`."""
     misfit: float
+    """Root mean square of what the loop leaves of the current, over that of what it moves."""
     output_misfit: float = 0.0
+    """The same of the loop's output: what is no PI of the error."""
     corner: float = 0.0
+    """R / L (1/s) as it follows: of the warm winding, with what the inverter adds."""
     std: tuple[float, float, float] = (math.inf, math.inf, math.inf)
+    """Of K_p, K_i and K_i / K_p (relative), by what single records differ in."""
 
 
 def fit_current_loop(

@@ -41,30 +41,20 @@ _NO_VALUES = "give a run that identified them, or name others"
 
 @dataclass(frozen=True, slots=True)
 class Earlier:
-    """What a run recorded.
-
-    Attributes
-    ----------
-    run : str
-        Name of its directory.
-    level : Method
-        How it measured, as ``identify --method`` names it.
-    drive : mapping
-        Identity of its drive.
-    request : IdentifyRequest
-        What it was asked.
-    estimates : mapping of str to Estimate
-        Accepted values by their keys.
-    machine : MachineParameters or None
-        What it knew of winding and magnets.
-    """
+    """What a run recorded."""
 
     run: str
+    """Name of its directory."""
     level: Method
+    """How it measured, as ``identify --method`` names it."""
     drive: Mapping[str, Any]
+    """Identity of its drive."""
     request: IdentifyRequest
+    """What it was asked."""
     estimates: Mapping[str, Estimate]
+    """Accepted values by their keys."""
     machine: MachineParameters | None
+    """What it knew of winding and magnets."""
 
     def measurable(self, quantities: Iterable[str]) -> tuple[str, ...]:
         """Return the quantities of which the run has a value.

@@ -42,27 +42,18 @@ LARGEST_ERROR_RAD = 0.5 * HALL_SECTOR_RAD
 
 @dataclass(frozen=True, slots=True)
 class HallAlignment:
-    """Three Hall sensors as they are wired and placed; electrical angles (rad).
-
-    Attributes
-    ----------
-    order : str
-        Phase whose sensor is on wires 1, 2, 3; ``abc`` is right.
-    offset_rad : float
-        By which all are turned against the phases.
-    offset_half_rad : float
-        Half of its 95 % interval.
-    errors_rad : tuple of float
-        Placement error of the sensors of phases a, b, c; they add up to 0.
-    lag_rad : float
-        Of the rotor behind the vector.
-    """
+    """Three Hall sensors as they are wired and placed; electrical angles (rad)."""
 
     order: str
+    """Phase whose sensor is on wires 1, 2, 3; ``abc`` is right."""
     offset_rad: float
+    """By which all are turned against the phases."""
     offset_half_rad: float
+    """Half of its 95 % interval."""
     errors_rad: tuple[float, float, float]
+    """Placement error of the sensors of phases a, b, c; they add up to 0."""
     lag_rad: float
+    """Of the rotor behind the vector."""
 
     @property
     def wiring(self) -> str:

@@ -39,21 +39,15 @@ _COLUMNS = (*PARAMETERS, "encoder_rad", "T_winding_c", "T_magnet_c", "U_dc_v", "
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """One criterion of the design over the interval of one value.
-
-    Attributes
-    ----------
-    what, unit : str
-        ``current_q phase margin`` (deg), ``voltage headroom to base speed`` (%), ...
-    nominal, worst, least : float
-        Of the machine as written, the least over the interval, and the limit.
-    """
+    """One criterion of the design over the interval of one value."""
 
     what: str
     unit: str
+    """``current_q phase margin`` (deg), ``voltage headroom to base speed`` (%), ..."""
     nominal: float
     worst: float
     least: float
+    """Of the machine as written, the least over the interval, and the limit."""
 
     @property
     def ok(self) -> bool:

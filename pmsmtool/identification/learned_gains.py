@@ -75,26 +75,18 @@ UNITS = {"gain": "N m s/rad", "value": "N m/rad", "rate": "1/s", "time": "s"}
 
 @dataclass(frozen=True, slots=True)
 class Basis:
-    """What scales rest on: inertia or inductance, and what the model of the loop leaves (relative).
-
-    Attributes
-    ----------
-    value, std : float
-        SI value, and its standard deviation.
-    widest : float
-        Half width (95 %) of a scale beyond which it stays unknown.
-    model, change : tuple of float
-        Standard deviations of K_p and K_i, and of a ratio of two K_p, K_i or K_i / K_p.
-    units : dict of str to str
-        Of one count, by form; ``gain`` is K_p.
-    """
+    """What scales rest on: inertia or inductance, and what the model of the loop leaves (relative)."""
 
     value: float
     std: float
+    """SI value, and its standard deviation."""
     widest: float = WIDEST
+    """Half width (95 %) of a scale beyond which it stays unknown."""
     model: tuple[float, float] = MODEL_DOUBT
     change: tuple[float, float, float] = CHANGE_DOUBT
+    """Standard deviations of K_p and K_i, and of a ratio of two K_p, K_i or K_i / K_p."""
     units: Mapping[str, str] = field(default_factory=lambda: UNITS)
+    """Of one count, by form; ``gain`` is K_p."""
 
 
 def current_basis(L_h: float, L_std: float) -> Basis:
@@ -104,23 +96,16 @@ def current_basis(L_h: float, L_std: float) -> Basis:
 
 @dataclass(frozen=True, slots=True)
 class Rotor:
-    """What the scales of gains rest on.
-
-    Attributes
-    ----------
-    J_kgm2, J_std : float
-        Inertia of all that turns, and its standard deviation (relative).
-    time_constant_s : float
-        J R / (K_T K_E): without feed-forward of the EMF a current loop of bandwidth w lags an acceleration as if the
-        inertia were larger by 1 / (w tau).
-    f_s_hz : float
-        Switching frequency, which bounds the bandwidth.
-    """
+    """What the scales of gains rest on."""
 
     J_kgm2: float
     J_std: float
+    """Inertia of all that turns, and its standard deviation (relative)."""
     time_constant_s: float
+    """J R / (K_T K_E): without feed-forward of the EMF a current loop of bandwidth w lags an acceleration as if the
+    inertia were larger by 1 / (w tau)."""
     f_s_hz: float
+    """Switching frequency, which bounds the bandwidth."""
 
     @property
     def basis(self) -> Basis:
@@ -135,31 +120,21 @@ class Rotor:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One measured loop, and what was so meanwhile.
-
-    Attributes
-    ----------
-    gain, integral : float
-        Counts that both gains held.
-    loop : SpeedLoop
-        What was measured.
-    current_share : float
-        Largest current over the rated one.
-    model_std : tuple of float
-        Standard deviation of K_p, K_i and K_i / K_p (relative) by the EMF's share and by where the loop's lag lies.
-    asked : AskedLoop or None
-        What the current that the loop asked for says, where the drive shows it.
-    at_once : float or None
-        Share of the current that flows at once, where torque pulses showed it.
-    """
+    """One measured loop, and what was so meanwhile."""
 
     gain: float
     integral: float
+    """Counts that both gains held."""
     loop: SpeedLoop
+    """What was measured."""
     current_share: float = 1.0
+    """Largest current over the rated one."""
     model_std: tuple[float, float, float] = NO_DOUBT
+    """Standard deviation of K_p, K_i and K_i / K_p (relative) by the EMF's share and by where the loop's lag lies."""
     asked: AskedLoop | None = None
+    """What the current that the loop asked for says, where the drive shows it."""
     at_once: float | None = None
+    """Share of the current that flows at once, where torque pulses showed it."""
 
     @property
     def loops(self) -> tuple[SpeedLoop, ...]:
@@ -185,33 +160,22 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """What was found of one gain.
-
-    Attributes
-    ----------
-    name : str
-        Catalogue name.
-    scale : float or None
-        SI value of one count in the unit of the form; None: unknown.
-    half_width : float
-        Of the scale, relative, 95 %; also where it stays unknown.
-    form : str or None
-        ``value``, ``rate`` or ``time``, as a drive map names it; None: unknown.
-    unit : str
-        Of one count; empty where the form is unknown.
-    why : str
-        Why it stays unknown; empty where it does not.
-    chi_squares : dict of str to float
-        Of every hypothesis about the form.
-    """
+    """What was found of one gain."""
 
     name: str
+    """Catalogue name."""
     scale: float | None
+    """SI value of one count in the unit of the form; None: unknown."""
     half_width: float
+    """Of the scale, relative, 95 %; also where it stays unknown."""
     form: str | None
+    """``value``, ``rate`` or ``time``, as a drive map names it; None: unknown."""
     unit: str
+    """Of one count; empty where the form is unknown."""
     why: str = ""
+    """Why it stays unknown; empty where it does not."""
     chi_squares: dict[str, float] = field(default_factory=dict)
+    """Of every hypothesis about the form."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,22 +61,15 @@ UNIT = "1/s"
 
 @dataclass(frozen=True, slots=True)
 class PositionLag:
-    """What moves with one gain showed.
-
-    Attributes
-    ----------
-    gain_per_s : float
-        Speed over lag (1/s).
-    std : float
-        Its standard deviation (relative).
-    forward, forward_std : float
-        Share of the demanded speed that is fed forward, and its standard deviation.
-    """
+    """What moves with one gain showed."""
 
     gain_per_s: float
+    """Speed over lag (1/s)."""
     std: float
+    """Its standard deviation (relative)."""
     forward: float
     forward_std: float
+    """Share of the demanded speed that is fed forward, and its standard deviation."""
 
 
 def position_lag(trace: Trace, rad_per_count: float) -> PositionLag:

@@ -41,26 +41,18 @@ UNDRIVEN_SHARE = 0.1
 
 @dataclass(frozen=True, slots=True)
 class RoughShaft:
-    """What is known of a shaft before it is measured.
-
-    Attributes
-    ----------
-    J, B, tau_c : float
-        Inertia (kg m2), viscous (N m s) and Coulomb friction (N m); friction 0 where nothing was seen of it.
-    torque_per_a : float
-        Torque per q current (N m/A).
-    step_rad : float
-        Step of the encoder (rad).
-    pole_pairs : int
-        Of the machine.
-    """
+    """What is known of a shaft before it is measured."""
 
     J: float
     B: float
     tau_c: float
+    """Inertia (kg m2), viscous (N m s) and Coulomb friction (N m); friction 0 where nothing was seen of it."""
     torque_per_a: float
+    """Torque per q current (N m/A)."""
     step_rad: float
+    """Step of the encoder (rad)."""
     pole_pairs: int = 1
+    """Of the machine."""
 
 
 def rough_friction(speeds: Trace, J: float, torque_per_a: float, pole_pairs: int) -> tuple[float, float]:
@@ -187,25 +179,17 @@ class ResponsePlan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ResponsePrediction:
-    """Relative standard deviation of the response of a rigid shaft over frequency.
-
-    Attributes
-    ----------
-    frequency_hz, std : ndarray, shape (n,)
-        Lines (Hz), and relative standard deviation of the magnitude at each.
-    highest_hz : float
-        Up to where the response will be coherent (Hz).
-    J : float
-        Relative standard deviation of the inertia that its lines give, without the torque's scale.
-    deviation_a : float
-        Standard deviation of the current that shakes the shaft (A).
-    """
+    """Relative standard deviation of the response of a rigid shaft over frequency."""
 
     frequency_hz: Array
     std: Array
+    """Lines (Hz), and relative standard deviation of the magnitude at each. Shape (n,)."""
     highest_hz: float
+    """Up to where the response will be coherent (Hz)."""
     J: float
+    """Relative standard deviation of the inertia that its lines give, without the torque's scale."""
     deviation_a: float
+    """Standard deviation of the current that shakes the shaft (A)."""
 
     def at(self, frequency_hz: float) -> float:
         """Return the relative standard deviation at a frequency."""

@@ -223,40 +223,28 @@ REQUEST = "request.json"
 
 @dataclass(frozen=True, slots=True)
 class IdentifyRequest:
-    """What is asked, and what the machine may do meanwhile; None leaves the choice to the drive's own ratings.
-
-    Attributes
-    ----------
-    quantities : tuple of str
-        Out of ``R L psi encoder poles inverter mechanics map frf cogging harmonics``.
-    i_max_apk, speed_max_rad_s : float or None
-        Envelope (A peak, rad/s mechanical).
-    shaft, load, brake : str
-        What hangs on the shaft and may happen to it.
-    accuracy : float or None
-        Statistical 95 % half width, relative, of R, L and psi at which the run stops collecting; None: all of it.
-    map_if_saturated : bool
-        Whether a machine that the run over speeds shows to saturate is mapped, too.
-    resonance : bool
-        Whether the shaft's frequency response is measured without being judged: an elastic shaft decides the speed
-        loop, and nothing else shows it.
-    tolerance : SensorTolerance
-        Declared sensor tolerances.
-    left_out : mapping of str to str
-        Quantities that a person named beside these, and why this drive does not give them: refused by that reason.
-    """
+    """What is asked, and what the machine may do meanwhile; None leaves the choice to the drive's own ratings."""
 
     quantities: tuple[str, ...] = QUANTITIES
+    """Out of ``R L psi encoder poles inverter mechanics map frf cogging harmonics``."""
     i_max_apk: float | None = None
     speed_max_rad_s: float | None = None
+    """Envelope (A peak, rad/s mechanical)."""
     shaft: Shaft = "free"
     load: Load = "none"
     brake: Brake = "none"
+    """What hangs on the shaft and may happen to it."""
     accuracy: float | None = None
+    """Statistical 95 % half width, relative, of R, L and psi at which the run stops collecting; None: all of it."""
     map_if_saturated: bool = False
+    """Whether a machine that the run over speeds shows to saturate is mapped, too."""
     resonance: bool = False
+    """Whether the shaft's frequency response is measured without being judged: an elastic shaft decides the speed
+    loop, and nothing else shows it."""
     tolerance: SensorTolerance = field(default_factory=SensorTolerance)
+    """Declared sensor tolerances."""
     left_out: Mapping[str, str] = field(default_factory=dict)
+    """Quantities that a person named beside these, and why this drive does not give them: refused by that reason."""
 
     @property
     def measured(self) -> tuple[str, ...]:

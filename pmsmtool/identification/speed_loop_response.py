@@ -87,61 +87,42 @@ class Emf(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StepRecord:
-    """Answers to steps of a speed reference, whose unit is known by the held speed before them.
-
-    Attributes
-    ----------
-    t_s, position_rad, current_a : ndarray, shape (n,)
-        Samples; the current as the drive shows it.
-    references : sequence of (s, rad/s)
-        When a reference was written, and which.
-    segments : sequence of (s, s)
-        Where the samples count: the current keeps its sign there.
-    noise_rad, noise_a : float
-        Standard deviation of position and current at a held speed.
-    asked_a : ndarray, shape (n,), or None
-        Current that the speed loop asks for, where the drive shows it.
-    asked_later_s : float
-        How much later than the current that one was read.
-    """
+    """Answers to steps of a speed reference, whose unit is known by the held speed before them."""
 
     t_s: Array
     position_rad: Array
     current_a: Array
+    """Samples; the current as the drive shows it. Shape (n,)."""
     references: Sequence[tuple[float, float]]
+    """When a reference was written, and which. Sequence of (s, rad/s)."""
     segments: Sequence[tuple[float, float]]
+    """Where the samples count: the current keeps its sign there. Sequence of (s, s)."""
     noise_rad: float
     noise_a: float
+    """Standard deviation of position and current at a held speed."""
     asked_a: Array | None = None
+    """Current that the speed loop asks for, where the drive shows it. Shape (n,), or None."""
     asked_later_s: float = 0.0
+    """How much later than the current that one was read."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpeedLoop:
-    """What one record says of a speed loop.
-
-    Attributes
-    ----------
-    K_p_per_J, K_i_per_J : float
-        Gains over the inertia (1/s and 1/s2).
-    lag_s, late_s : float
-        Of the loop; from the write of a reference to its effect.
-    amps_per_rad_s2 : float
-        Shown current per acceleration: J over the torque per shown ampere.
-    misfit : float
-        Root mean square of what the loop leaves of the current, in its noise.
-    at_bound : str
-        Which time the fit ended at the bound of (``lag``, ``late``, ``age``): no loop of this kind answers so. Else
-        empty.
-    """
+    """What one record says of a speed loop."""
 
     K_p_per_J: float
     K_i_per_J: float
+    """Gains over the inertia (1/s and 1/s2)."""
     lag_s: float
     late_s: float
+    """Of the loop; from the write of a reference to its effect."""
     amps_per_rad_s2: float
+    """Shown current per acceleration: J over the torque per shown ampere."""
     misfit: float = 1.0
+    """Root mean square of what the loop leaves of the current, in its noise."""
     at_bound: str = ""
+    """Which time the fit ended at the bound of (``lag``, ``late``, ``age``): no loop of this kind answers so. Else
+    empty."""
 
 
 def fit_pulses(pulses: Sequence[tuple[Array, Array]], assumed: Emf) -> Emf | None:

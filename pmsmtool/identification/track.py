@@ -102,24 +102,17 @@ def replay_observations(run: RunDirectory) -> Trace:
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """A track with what it says of the temperatures.
-
-    Attributes
-    ----------
-    track : Track
-        R and psi over time.
-    temperatures : mapping of str to (value, std)
-        ``T_winding_c`` from R and ``T_magnet_c`` from psi at the end (degC), with the doubt of the identified values.
-    systematic : mapping of str to float
-        95 % half widths that the sensors' scales leave (:func:`systematic_of`).
-    sensor_c : float
-        Mean reading of the winding's sensor (degC); NaN without one.
-    """
+    """A track with what it says of the temperatures."""
 
     track: Track
+    """R and psi over time."""
     temperatures: dict[str, tuple[float, float]]
+    """``T_winding_c`` from R and ``T_magnet_c`` from psi at the end (degC), with the doubt of the identified values.
+    Mapping of str to (value, std)."""
     systematic: dict[str, float]
+    """95 % half widths that the sensors' scales leave (:func:`systematic_of`)."""
     sensor_c: float
+    """Mean reading of the winding's sensor (degC); NaN without one."""
 
 
 def follow(observations: Trace, known: Known, machine: MachineFile, wanted: Sequence[str] = TRACKED) -> Tracked:

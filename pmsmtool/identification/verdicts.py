@@ -51,18 +51,12 @@ NOT_ACCEPTED = "E_NOT_ACCEPTED"
 
 @dataclass(frozen=True, slots=True)
 class Verdicts:
-    """What became of each quantity that was asked for.
-
-    Attributes
-    ----------
-    accepted : tuple of str
-        Quantities.
-    refused : mapping of str to str
-        Quantity -> reason: name and sentence.
-    """
+    """What became of each quantity that was asked for."""
 
     accepted: tuple[str, ...]
+    """Quantities."""
     refused: Mapping[str, str]
+    """Quantity -> reason: name and sentence."""
 
     @property
     def status(self) -> Status:

@@ -63,24 +63,16 @@ SHOWN_BY = "the object that shows the current has the other sign, or shows magni
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One row of the check.
-
-    Attributes
-    ----------
-    looked_at : str
-        What was looked at.
-    verdict : str
-        ``ok``, ``WRONG``, ``not seen``: nothing is said of it, or ``NOT CHECKED``: this drive cannot show it.
-    shown : str
-        What was seen.
-    likely : str
-        Likely causes of what is wrong, the most likely first.
-    """
+    """One row of the check."""
 
     looked_at: str
+    """What was looked at."""
     verdict: str
+    """``ok``, ``WRONG``, ``not seen``: nothing is said of it, or ``NOT CHECKED``: this drive cannot show it."""
     shown: str
+    """What was seen."""
     likely: str = ""
+    """Likely causes of what is wrong, the most likely first."""
 
 
 def judge_turn(turn: Trace, pole_pairs: int, counts_against: bool) -> list[Finding]:

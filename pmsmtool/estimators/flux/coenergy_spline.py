@@ -63,16 +63,11 @@ def _basis(knots: Array, x: Array, degree: int, derivative: int) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoenergySpline:
-    """The spline space over a rectangle of currents.
-
-    Attributes
-    ----------
-    breaks_d, breaks_q : ndarray
-        Break points (A).
-    """
+    """The spline space over a rectangle of currents."""
 
     breaks_d: Array
     breaks_q: Array
+    """Break points (A)."""
 
     @classmethod
     def over(cls, i_d_a: Array, i_q_a: Array, pieces: tuple[int, int]) -> CoenergySpline:

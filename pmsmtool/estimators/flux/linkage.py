@@ -83,51 +83,36 @@ LEVEL_RATIO = 1.2
 
 @dataclass(frozen=True, slots=True)
 class FluxResult:
-    """PM flux linkage and what the same run says about angle and L_q.
-
-    Attributes
-    ----------
-    psi_f : Estimate
-        PM flux linkage at the reference temperature (Wb).
-    psi_measured : Estimate
-        The same at the temperature of the run (Wb).
-    frame_offset : Estimate
-        Angle of the frame ahead of the d axis (rad electrical): add it to the stored encoder offset.
-    apart_wb : float
-        How far the flux linkage by driving currents lies from this one, where beyond what both say of themselves: then
-        an effect that neither knows, iron loss above all, is in them, and it is a standard deviation here. Else 0 (Wb).
-    driven : Estimate or None
-        PM flux linkage at the reference temperature by the run's q currents, a check only (Wb); None without them.
-    voltage_scale_std : float
-        Relative standard deviation that both have from the bridge's thresholds.
-    L_q_app : Estimate
-        Apparent L_q at the q currents of the run, a check only: beside a large dead time it says nothing, and its
-        standard deviation says so (H).
-    curvature : float
-        Mean of psi_d(i_d) and psi_d(-i_d) over psi_f, less one, at the largest d current.
-    low_wb, low_std_wb, low_i_d_a : float
-        That mean itself at the smallest d current (Wb, Wb, A): measured, where psi_f of a machine that saturates is
-        extrapolated.
-    omega_rad_s, residual_wb : ndarray, shape (n,)
-        Electrical speed of every pair of d currents, and what its flux linkage is off (rad/s, Wb).
-    shown : ShownInstant or None
-        What the d voltage says about the instant at which currents are sampled; None without a modulation.
-    """
+    """PM flux linkage and what the same run says about angle and L_q."""
 
     psi_f: Estimate
+    """PM flux linkage at the reference temperature (Wb)."""
     psi_measured: Estimate
+    """The same at the temperature of the run (Wb)."""
     frame_offset: Estimate
+    """Angle of the frame ahead of the d axis (rad electrical): add it to the stored encoder offset."""
     driven: Estimate | None
+    """PM flux linkage at the reference temperature by the run's q currents, a check only (Wb); None without them."""
     voltage_scale_std: float
+    """Relative standard deviation that both have from the bridge's thresholds."""
     L_q_app: Estimate
+    """Apparent L_q at the q currents of the run, a check only: beside a large dead time it says nothing, and its
+    standard deviation says so (H)."""
     curvature: float
+    """Mean of psi_d(i_d) and psi_d(-i_d) over psi_f, less one, at the largest d current."""
     low_wb: float
     low_std_wb: float
     low_i_d_a: float
+    """That mean itself at the smallest d current (Wb, Wb, A): measured, where psi_f of a machine that saturates is
+    extrapolated."""
     omega_rad_s: Array
     residual_wb: Array
+    """Electrical speed of every pair of d currents, and what its flux linkage is off (rad/s, Wb). Shape (n,)."""
     shown: ShownInstant | None = None
+    """What the d voltage says about the instant at which currents are sampled; None without a modulation."""
     apart_wb: float = 0.0
+    """How far the flux linkage by driving currents lies from this one, where beyond what both say of themselves: then
+    an effect that neither knows, iron loss above all, is in them, and it is a standard deviation here. Else 0 (Wb)."""
 
 
 def estimate_flux_linkage(

@@ -40,31 +40,22 @@ ANGLES = 60
 
 @dataclass(frozen=True, slots=True)
 class Corrected:
-    """Rows without resistance and inverter error.
-
-    Attributes
-    ----------
-    w, acceleration_rad_s2 : ndarray, shape (n,)
-        Electrical speed at the time of the voltage, and its slope.
-    i_d, i_q : ndarray, shape (n,)
-        Mean currents (A).
-    u_d, u_q : ndarray, shape (n,)
-        Voltage of the flux linkages (V).
-    ripple_q_v, curve_q_v : ndarray, shape (n,)
-        q parts of the error that was taken off: of the ripple, and of the sampled current (V).
-    is_d : ndarray of bool, shape (n,)
-        Rows with a d current.
-    """
+    """Rows without resistance and inverter error."""
 
     w: Array
     acceleration_rad_s2: Array
+    """Electrical speed at the time of the voltage, and its slope. Shape (n,)."""
     i_d: Array
     i_q: Array
+    """Mean currents (A). Shape (n,)."""
     u_d: Array
     u_q: Array
+    """Voltage of the flux linkages (V). Shape (n,)."""
     ripple_q_v: Array
     curve_q_v: Array
+    """q parts of the error that was taken off: of the ripple, and of the sampled current (V). Shape (n,)."""
     is_d: NDArray[np.bool_]
+    """Rows with a d current. Shape (n,)."""
 
 
 def pairs_of(speeds: Trace) -> list[tuple[int, int]]:

@@ -74,78 +74,53 @@ DISC_POINTS = 25
 
 @dataclass(frozen=True, slots=True)
 class MagnetFlux:
-    """psi_d where another experiment measured it, at the temperature of the pulses.
-
-    Attributes
-    ----------
-    psi_wb, std_wb : float
-        Mean of psi_d over the points (Wb), and its standard deviation.
-    i_d_a, i_q_a : tuple of float
-        The points (A); a run with i_d of both signs means the mean of psi_d there, not psi_d at zero current.
-    weight : tuple of float
-        Their weights, of sum one.
-    """
+    """psi_d where another experiment measured it, at the temperature of the pulses."""
 
     psi_wb: float
     std_wb: float
+    """Mean of psi_d over the points (Wb), and its standard deviation."""
     i_d_a: tuple[float, ...] = (0.0,)
     i_q_a: tuple[float, ...] = (0.0,)
+    """The points (A); a run with i_d of both signs means the mean of psi_d there, not psi_d at zero current."""
     weight: tuple[float, ...] = (1.0,)
+    """Their weights, of sum one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoenergyFit:
-    """A fitted co-energy.
-
-    Attributes
-    ----------
-    spline : CoenergySpline
-        Its space.
-    c : ndarray, shape (k,)
-        Coefficients.
-    covariance : ndarray, shape (k, k)
-        Of the coefficients, widened by the residual and by how much neighbouring residuals say the same.
-    delay_s : float
-        Delay of the current sample that fits (s).
-    sigma_a : float
-        Noise of one sample (A).
-    chi2 : float
-        Reduced chi-square of the current residual against the noise.
-    n : int
-        Residuals.
-    symmetric : bool
-        Whether W is even in i_q.
-    asymmetry : float
-        Rms of the flux that breaks the symmetry in the free fit (Wb).
-    axis_rad : float
-        Angle of the symmetry axis from the frame's d axis (rad electrical).
-    skew : FittedSkew
-        Flux that has no co-energy.
-    frame : Frame
-        The angles used.
-    magnet_std_wb : float
-        Standard deviation of the flux at zero current (Wb).
-    unphysical_wb : float
-        Rms of what the pulses show and no machine has (Wb), as a deviation of every flux.
-    unseen : float
-        Relative deviation of the inductances that the angles of the pulses leave of their mean over all angles.
-    """
+    """A fitted co-energy."""
 
     spline: CoenergySpline
+    """Its space."""
     c: Array
+    """Coefficients. Shape (k,)."""
     covariance: Array
+    """Of the coefficients, widened by the residual and by how much neighbouring residuals say the same.
+    Shape (k, k)."""
     delay_s: float
+    """Delay of the current sample that fits (s)."""
     sigma_a: float
+    """Noise of one sample (A)."""
     chi2: float
+    """Reduced chi-square of the current residual against the noise."""
     n: int
+    """Residuals."""
     symmetric: bool
+    """Whether W is even in i_q."""
     asymmetry: float
+    """Rms of the flux that breaks the symmetry in the free fit (Wb)."""
     axis_rad: float
+    """Angle of the symmetry axis from the frame's d axis (rad electrical)."""
     skew: FittedSkew
+    """Flux that has no co-energy."""
     frame: Frame
+    """The angles used."""
     magnet_std_wb: float
+    """Standard deviation of the flux at zero current (Wb)."""
     unphysical_wb: float = 0.0
+    """Rms of what the pulses show and no machine has (Wb), as a deviation of every flux."""
     unseen: float = 0.0
+    """Relative deviation of the inductances that the angles of the pulses leave of their mean over all angles."""
 
     def flux(self, i_d_a: Array, i_q_a: Array) -> Array:
         """Return psi_d, psi_q (Wb), shape (2, n)."""
@@ -197,19 +172,13 @@ def _spacing(breaks: Array, x: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FittedSkew:
-    """psi_d + skew(i) and psi_q of a fit that need not have a co-energy.
-
-    Attributes
-    ----------
-    gradient : ndarray
-        Coefficients of its co-energy part.
-    spline, c
-        Space and coefficients of what is added to psi_d.
-    """
+    """psi_d + skew(i) and psi_q of a fit that need not have a co-energy."""
 
     gradient: Array
+    """Coefficients of its co-energy part."""
     spline: CoenergySpline
     c: Array
+    """Space and coefficients of what is added to psi_d."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -53,47 +53,33 @@ RECIPROCITY_NOTED = 0.002
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FluxMapResult:
-    """A measured flux map.
-
-    Attributes
-    ----------
-    flux_map : FluxMap
-        At the reference temperature; outside the disc of ``radius_a`` continued linearly.
-    identified : ndarray of bool, shape (n_d, n_q)
-        Nodes that data support.
-    psi_std_wb : ndarray, shape (2, n_d, n_q)
-        Standard deviations of psi_d, psi_q.
-    L_h, L_std_h : ndarray, shape (3, n_d, n_q)
-        Incremental L_dd, L_dq, L_qq and their standard deviations; NaN where not identified.
-    radius_a : float
-        Current up to which the plane is known (A peak).
-    span_wb : float
-        Flux range, the reference of relative numbers.
-    misfit, asymmetry, skew : float
-        Flux residual beyond noise, flux that breaks the symmetry in i_q, distance of the freer model to a reciprocal
-        map; rms, of the flux range.
-    fit : CoenergyFit
-        Behind it all.
-    systematic_flux, systematic_current : float
-        Relative 95 % half widths of the two scales that no experiment sees.
-    notes : tuple of str
-        What a reader should know.
-    """
+    """A measured flux map."""
 
     flux_map: FluxMap
+    """At the reference temperature; outside the disc of ``radius_a`` continued linearly."""
     identified: NDArray[np.bool_]
+    """Nodes that data support. Shape (n_d, n_q)."""
     psi_std_wb: Array
+    """Standard deviations of psi_d, psi_q. Shape (2, n_d, n_q)."""
     L_h: Array
     L_std_h: Array
+    """Incremental L_dd, L_dq, L_qq and their standard deviations; NaN where not identified. Shape (3, n_d, n_q)."""
     radius_a: float
+    """Current up to which the plane is known (A peak)."""
     span_wb: float
+    """Flux range, the reference of relative numbers."""
     misfit: float
     asymmetry: float
     skew: float
+    """Flux residual beyond noise, flux that breaks the symmetry in i_q, distance of the freer model to a reciprocal
+    map; rms, of the flux range."""
     fit: CoenergyFit
+    """Behind it all."""
     systematic_flux: float
     systematic_current: float
+    """Relative 95 % half widths of the two scales that no experiment sees."""
     notes: tuple[str, ...]
+    """What a reader should know."""
 
     @property
     def deviation(self) -> float:

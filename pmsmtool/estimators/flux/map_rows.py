@@ -49,21 +49,14 @@ NUISANCES = ("R_ohm", "inverter", *(f"iron_{n:g}_s" for n in IRON_PERIODS), "del
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """How the recorded angle becomes the angle of the d axis: theta_e = direction p theta_M - offset.
-
-    Attributes
-    ----------
-    pole_pairs : int
-        Pole pairs times direction.
-    drive_offset_rad : float
-        Offset the drive used while it recorded.
-    offset_rad : float
-        The right one.
-    """
+    """How the recorded angle becomes the angle of the d axis: theta_e = direction p theta_M - offset."""
 
     pole_pairs: int
+    """Pole pairs times direction."""
     drive_offset_rad: float
+    """Offset the drive used while it recorded."""
     offset_rad: float
+    """The right one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,29 +73,20 @@ class Legs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PulseIntegrals:
-    """One trace as integrals; arrays of shape (2, n) unless stated.
-
-    Attributes
-    ----------
-    i : ndarray
-        Currents in the rotor frame (A).
-    theta : ndarray, shape (n,)
-        Electrical angle of the d axis (rad).
-    volt_seconds, current_seconds, error_seconds : ndarray
-        Integrals of voltage, current and the inverter's measured error up to each sample, stator frame (V s, A s).
-    volts_before : ndarray
-        Voltage of the interval before each sample, stator frame (V).
-    first : int
-        First row whose voltages are all known.
-    """
+    """One trace as integrals; arrays of shape (2, n) unless stated."""
 
     i: Array
+    """Currents in the rotor frame (A)."""
     theta: Array
+    """Electrical angle of the d axis (rad). Shape (n,)."""
     volt_seconds: Array
     current_seconds: Array
     error_seconds: Array
+    """Integrals of voltage, current and the inverter's measured error up to each sample, stator frame (V s, A s)."""
     volts_before: Array
+    """Voltage of the interval before each sample, stator frame (V)."""
     first: int
+    """First row whose voltages are all known."""
 
 
 def integrate_pulses(
@@ -235,21 +219,15 @@ def _cumulated(per_interval: Array) -> Array:
 
 @dataclass(slots=True)
 class NormalEquations:
-    """Sums of the whitened rows: x minimises x' A x - 2 b' x + c.
-
-    Attributes
-    ----------
-    A : ndarray, shape (k, k)
-    b : ndarray, shape (k,)
-    c : float
-    n : int
-        Residuals, the projected constants taken off.
-    """
+    """Sums of the whitened rows: x minimises x' A x - 2 b' x + c."""
 
     A: Array
+    """Shape (k, k)."""
     b: Array
+    """Shape (k,)."""
     c: float = 0.0
     n: int = 0
+    """Number of residuals, the projected constants taken off."""
 
     def add(self, rows: Array, target: Array) -> None:
         """Add rows (n, k) with their targets (n,)."""

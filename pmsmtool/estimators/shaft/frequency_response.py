@@ -76,51 +76,35 @@ METHOD = "random torque at speed, maximum likelihood in the frequency domain"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrequencyResponse:
-    """Acceleration per torque over frequency, and what it says of the shaft.
-
-    Attributes
-    ----------
-    frequency_hz : ndarray, shape (n,)
-        Lines (Hz).
-    response : ndarray, shape (n,)
-        Acceleration per torque (rad/s2/(N m)).
-    std : ndarray, shape (n,)
-        Standard deviation of its magnitude.
-    coherence : ndarray, shape (n,)
-        Share of the answer's power that the torque explains.
-    highest_hz : float
-        End of the band that the data support (Hz).
-    chi2_rigid, chi2_two_mass : float
-        Reduced chi-square of either model; NaN where there was no start for a second mass.
-    information_gain : float
-        How much the information criterion prefers two masses.
-    found : mapping of str to Estimate
-        ``resonance_hz``, ``antiresonance_hz``, ``resonance_zeta`` where a second mass is supported, else nothing.
-    reason : str
-        Why a second mass is claimed, or is not.
-    inertia : Estimate or None
-        All that turns, of the model that explains the response: 1/J of a rigid shaft, the low-frequency end
-        J_M w_r^2/w_a^2 of two masses (kg m2); None where neither explains it. Its interval holds both where two masses
-        explain more and are not claimed.
-    shown_hz : float
-        Up to where a small second mass would have shown, where none is found (Hz); 0: nowhere.
-    suspected_hz : tuple of float
-        Resonance and antiresonance (Hz) of a second mass that is shown, but not claimed; else empty.
-    """
+    """Acceleration per torque over frequency, and what it says of the shaft."""
 
     frequency_hz: Array
+    """Lines (Hz). Shape (n,)."""
     response: Complex
+    """Acceleration per torque (rad/s2/(N m)). Shape (n,)."""
     std: Array
+    """Standard deviation of its magnitude. Shape (n,)."""
     coherence: Array
+    """Share of the answer's power that the torque explains. Shape (n,)."""
     highest_hz: float
+    """End of the band that the data support (Hz)."""
     chi2_rigid: float
     chi2_two_mass: float
+    """Reduced chi-square of either model; NaN where there was no start for a second mass."""
     information_gain: float
+    """How much the information criterion prefers two masses."""
     found: dict[str, Estimate] = field(default_factory=dict)
+    """``resonance_hz``, ``antiresonance_hz``, ``resonance_zeta`` where a second mass is supported, else nothing."""
     reason: str = ""
+    """Why a second mass is claimed, or is not."""
     inertia: Estimate | None = None
+    """All that turns, of the model that explains the response: 1/J of a rigid shaft, the low-frequency end
+    J_M w_r^2/w_a^2 of two masses (kg m2); None where neither explains it. Its interval holds both where two masses
+    explain more and are not claimed."""
     shown_hz: float = 0.0
+    """Up to where a small second mass would have shown, where none is found (Hz); 0: nowhere."""
     suspected_hz: tuple[float, ...] = ()
+    """Resonance and antiresonance (Hz) of a second mass that is shown, but not claimed; else empty."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the table that is kept as a file."""

@@ -37,39 +37,28 @@ POSITION_MODES = (1, 8)
 
 @dataclass(frozen=True, slots=True)
 class SetUp:
-    """The motor as its maker's set-up tool would have entered it.
-
-    Attributes
-    ----------
-    pole_pairs : int
-    R_s_ohm, L_q_h : float
-        Per phase.
-    i_nom_apk, i_max_apk : float
-        Rated and largest current (A peak).
-    torque_nm : float
-        Rated torque.
-    n_max_rpm : float
-        Largest speed.
-    counts : int
-        Encoder counts per turn.
-    K_p_v_per_a, K_i_v_per_as : float
-        Gains of the current loops.
-    J_kgm2, J_load_kgm2 : float
-        Inertia of the motor, for the speed loop; of the load besides, for the position loop.
-    """
+    """The motor as its maker's set-up tool would have entered it."""
 
     pole_pairs: int
+    """Of the motor."""
     R_s_ohm: float
     L_q_h: float
+    """Per phase."""
     i_nom_apk: float
     i_max_apk: float
+    """Rated and largest current (A peak)."""
     torque_nm: float
+    """Rated torque."""
     n_max_rpm: float
+    """Largest speed."""
     counts: int
+    """Encoder counts per turn."""
     K_p_v_per_a: float
     K_i_v_per_as: float
+    """Gains of the current loops."""
     J_kgm2: float
     J_load_kgm2: float = 0.0
+    """Inertia of the motor, for the speed loop; of the load besides, for the position loop."""
 
     @property
     def torque_constant(self) -> float:

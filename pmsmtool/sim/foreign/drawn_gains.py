@@ -70,57 +70,40 @@ SMALL_COUNTS = (30, 200)
 
 @dataclass(frozen=True, slots=True)
 class DrawnGains:
-    """What a seed drew; the truth of a benchmark.
-
-    Attributes
-    ----------
-    gain, integral : (index, sub)
-        Objects of the speed loop.
-    counts : tuple of int
-        What both hold at first.
-    K_p_nms_per_rad : float
-        One count of the gain (N m s/rad).
-    integral_scale : float
-        One count of the integral part: N m/rad (parallel), 1/s (rate) or s (time).
-    form : str
-        Of the integral part.
-    rms : bool
-        Whether the drive's currents are rms where no source says so.
-    filter_hz, decimation : float, int
-        Of the speed loop.
-    current_bandwidth : float
-        Of the current loop, times the control period.
-    position, forward : (index, sub) or None
-        Objects of the position gain and of the feed-forward of the speed.
-    position_counts, forward_counts : int
-        What they hold at first.
-    K_v_per_s, forward_share : float
-        One count of either.
-    acceleration_counts, acceleration_ff_s : int, float
-        Of the object of the acceleration: what it holds at first, and one count (s); 0: none.
-    current : DrawnGains or None
-        Of the current loops, where the drive has objects of them and a trace: V/A, and V/(A s), 1/s or s.
-    """
+    """What a seed drew; the truth of a benchmark."""
 
     gain: Address
     integral: Address
+    """Objects of the speed loop. (index, sub)."""
     counts: tuple[int, int]
+    """What both hold at first."""
     K_p_nms_per_rad: float
+    """One count of the gain (N m s/rad)."""
     integral_scale: float
+    """One count of the integral part: N m/rad (parallel), 1/s (rate) or s (time)."""
     form: Form
+    """Of the integral part."""
     rms: bool
+    """Whether the drive's currents are rms where no source says so."""
     filter_hz: float
     decimation: int
+    """Of the speed loop."""
     current_bandwidth: float
+    """Of the current loop, times the control period."""
     position: Address | None = None
     forward: Address | None = None
+    """Objects of the position gain and of the feed-forward of the speed. (index, sub) or None."""
     position_counts: int = 0
     forward_counts: int = 0
+    """What they hold at first."""
     K_v_per_s: float = 0.0
     forward_share: float = 0.0
+    """One count of either."""
     acceleration_counts: int = 0
     acceleration_ff_s: float = 0.0
+    """Of the object of the acceleration: what it holds at first, and one count (s); 0: none."""
     current: DrawnGains | None = None
+    """Of the current loops, where the drive has objects of them and a trace: V/A, and V/(A s), 1/s or s."""
 
     def K_i_nm_per_rad(self, gain: float, integral: float) -> float:
         """Return the integral gain that counts of both objects mean."""

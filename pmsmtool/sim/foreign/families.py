@@ -25,31 +25,21 @@ PROFILE_SHARE, PROFILE_RPS2 = 0.2, 40.0
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """What one object means.
-
-    Attributes
-    ----------
-    index, sub : int
-        The object.
-    source : str
-        Where it is stated, or ``assumed``.
-    set_up : float or None
-        What the maker's set-up tool leaves in it, in counts; None: what the file says stays.
-    show : callable or None
-        Returns the counts it shows.
-    act : callable or None
-        Takes the counts that are written.
-    commutates : bool
-        Whether the drive commutates by it, so that no other number will do.
-    """
+    """What one object means."""
 
     index: int
     sub: int
+    """The object."""
     source: str
+    """Where it is stated, or ``assumed``."""
     set_up: float | None = None
+    """What the maker's set-up tool leaves in it, in counts; None: what the file says stays."""
     show: Callable[[Behind], float] | None = None
+    """Returns the counts it shows."""
     act: Callable[[Behind, float], None] | None = None
+    """Takes the counts that are written."""
     commutates: bool = False
+    """Whether the drive commutates by it, so that no other number will do."""
 
 
 TENTH_OF_DEGREE, RPM, RPS = 0xFF41, 0xB447, 0xB403
@@ -160,45 +150,30 @@ Laws = Callable[[MakersObjects, SetUp], Iterator[Law]]
 
 @dataclass(frozen=True, slots=True)
 class Family:
-    """One maker's way to keep a motor.
-
-    Attributes
-    ----------
-    name : str
-        For people.
-    marks : tuple of (index, sub)
-        Objects by which it is recognised.
-    laws : callable
-        Its own laws; they stand before the standard's.
-    identity : tuple of int
-        Vendor and product where the file leaves them blank (``assumed``).
-    modes : int
-        0x6502 where the file leaves it blank (``assumed``).
-    own_modes : tuple of int
-        Modes of the maker's own, which 0x6502 does not announce.
-    speed_per_rps : float or None
-        Units of 0x606C per turn per second where the maker fixes them.
-    speed_source : str
-        Where that is stated.
-    per_turn : int
-        Units of position per turn where the maker fixes them; 0: the encoder's counts.
-    loop_s : float
-        Period of its position loop (s; ``assumed`` where it is a millisecond).
-    serial : tuple of int
-        Where the maker keeps the serial number beside 0x1018:04; empty: nowhere else.
-    """
+    """One maker's way to keep a motor."""
 
     name: str
+    """For people."""
     marks: tuple[tuple[int, int], ...]
+    """Objects by which it is recognised. Tuple of (index, sub)."""
     laws: Laws
+    """Its own laws; they stand before the standard's."""
     identity: tuple[int, int] = (0, 0)
+    """Vendor and product where the file leaves them blank (``assumed``)."""
     modes: int = 0
+    """0x6502 where the file leaves it blank (``assumed``)."""
     own_modes: tuple[int, ...] = ()
+    """Modes of the maker's own, which 0x6502 does not announce."""
     speed_per_rps: float | None = None
+    """Units of 0x606C per turn per second where the maker fixes them."""
     speed_source: str = ""
+    """Where that is stated."""
     per_turn: int = 0
+    """Units of position per turn where the maker fixes them; 0: the encoder's counts."""
     loop_s: float = 1e-3
+    """Period of its position loop (s; ``assumed`` where it is a millisecond)."""
     serial: tuple[int, ...] = ()
+    """Where the maker keeps the serial number beside 0x1018:04; empty: nowhere else."""
 
 
 def _current(index: int, sub: int, per_apk: float, source: str) -> Law:

@@ -72,24 +72,16 @@ DRIVE_PROFILE, PROFILES = 402, range(401, 500)
 
 @dataclass(frozen=True, slots=True)
 class MakersObjects:
-    """What a file says a drive has.
-
-    Attributes
-    ----------
-    name : str
-        Of the file or the family.
-    rows : mapping of (index, sub) to ObjectRow
-        Every object, sorted.
-    assumed : tuple of str
-        What is not the file's, one line each.
-    odd : tuple of str
-        Lines of an EDS or DCF that had to be interpreted, the first few, one line each.
-    """
+    """What a file says a drive has."""
 
     name: str
+    """Of the file or the family."""
     rows: Mapping[tuple[int, int], ObjectRow]
+    """Every object, sorted. Mapping of (index, sub) to ObjectRow."""
     assumed: tuple[str, ...]
+    """What is not the file's, one line each."""
     odd: tuple[str, ...] = ()
+    """Lines of an EDS or DCF that had to be interpreted, the first few, one line each."""
 
     def stored(self, index: int, sub: int = 0) -> int:
         """Return the whole number that the file says an object holds; 0 where it says none."""
