@@ -199,7 +199,8 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
     gains = np.array(mismatch.gains) if mismatch.corrected else np.zeros(3)
     order = np.argsort(pairs.meta.get("idle", list("aabbcc")), kind="stable")
     i, u = pairs["i_d_a"][order] / (1.0 - 0.5 * np.repeat(gains, 2)), pairs["u_d_v"][order]
-    lost = curve.error_v(math.sqrt(3.0) / 2.0 * i) * 2.0 / math.sqrt(3.0)
+    offset = math.hypot(noise.offset_d_a, noise.offset_q_a)
+    lost, beside = (curve.error_v(math.sqrt(3.0) / 2.0 * (i - off)) * 2.0 / math.sqrt(3.0) for off in (0.0, offset))
     steps = np.diff(i)[::2]
     raw = np.diff(u)[::2] / steps
     taken = np.diff(lost)[::2] / steps
@@ -212,7 +213,9 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
         std = max(std, math.sqrt(0.5 * float(np.mean(change**2))))
     std /= float(np.min(np.abs(steps)))
     limit = max(BALANCE_LIMIT * float(np.mean(slopes)), SLOPE_SIGMA * std)
+    # legs, and what offsets of the sensors are in the knee of the curve
     limit += LEG_DOUBT * float(np.max(np.abs(taken)))
+    limit += float(np.max(np.abs(lost - beside).reshape(3, 2).sum(axis=1) / np.abs(steps)))
     difference = float(np.ptp(slopes))
     moved = "moved" in pairs.signals and float(np.max(pairs["moved"])) > 0.0
     if not moved and not (difference <= limit and float(np.min(raw)) > 0.0):

@@ -534,12 +534,12 @@ class Measurement:
         Current sensors that differ spoil every value, so that ends the run.
         """
         largest = self.limits.I_test_apk
-        strongest = max(standstill.PAIR_SHARES) * largest
-        self.say(f"pairs of phases: two currents up to {strongest:.3g} A through each")
+        currents = standstill.pair_currents(self._kept["levels"].meta["i_command_a"], largest)
+        self.say(f"pairs of phases: two currents up to {currents[1]:.3g} A through each")
         turn_a, turn_s, quick = self.turn_share * largest, self._effort.turn_s, self._effort.quick
         start = float(self._kept["levels"]["theta_imposed_rad"][-1]) if quick else standstill.DC_ANGLE_RAD
         half = int(self._kept["levels"].meta["samples"]) // 2 if quick else None
-        pairs = standstill.hold_pairs(self.drive, largest, turn_a, start, turn_s, quick=quick, half=half)
+        pairs = standstill.hold_pairs(self.drive, currents, turn_a, start, turn_s, quick=quick, half=half)
         self._keep_for_later("phase_pairs", pairs)
         check_pairs(pairs, noise, resistance.curve)
         return start + (2.0 * standstill.PAIR_STEP_RAD if quick else standstill.PHASE_ANGLES_RAD[-1])

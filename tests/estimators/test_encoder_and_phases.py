@@ -292,6 +292,22 @@ def test_what_the_ripple_of_a_link_leaves_in_a_window_is_no_unequal_phase() -> N
     assert not any(rippled.beyond_mean_ohm) and rippled.std_ohm > 0.5 * off_v
 
 
+def test_what_offsets_of_sensors_make_in_the_knee_of_the_inverter_is_no_unbalanced_phase() -> None:
+    """A stranger's bridge of 560 V on 0.4 A: equal phases differed by 9 ohm of 8, of 60 that the knee takes."""
+    knee = InverterCurve(np.array([1.5, 10.0]), np.array([15.0, 18.0]), 0.0)  # the pairs hold 0.87 and 1.7 A a phase
+    shown = pairs((2.0, 2.0, 2.0))
+    seen = (
+        2.0 / math.sqrt(3.0) * knee.error_v(math.sqrt(3.0) / 2.0 * (shown["i_d_a"] + 0.05 * np.repeat([1, 0, -1], 2)))
+    )
+    shown = trace(**{**shown.signals, "u_d_v": 2.0 * shown["i_d_a"] + seen})
+    with pytest.raises(IdentificationError, match="E_UNBALANCED"):
+        check_pairs(shown, NOISE, knee)
+    found = check_pairs(shown, Noise(0.005, 0.03, -0.04), knee)
+    assert np.mean(found.resistance_ohm) == pytest.approx(2.0) and not any(found.beyond_mean_ohm)
+    with pytest.raises(IdentificationError, match="E_UNBALANCED"):  # beyond the knee an offset takes nothing
+        check_pairs(pairs((3.0, 2.0, 2.0)), Noise(0.005, 0.03, -0.04), STEP)
+
+
 @pytest.mark.parametrize(
     ("found", "reason"),
     [

@@ -19,7 +19,6 @@ from pmsmtool.experiments.standstill import (
     DC_ANGLE_RAD,
     NEAR_ANGLES_RAD,
     PAIR_ARRIVED,
-    PAIR_SHARES,
     SWINGING_TURN_S,
     LevelPlan,
     calm_sequence,
@@ -27,10 +26,12 @@ from pmsmtool.experiments.standstill import (
     hold_levels,
     hold_pairs,
     hold_phase_vectors,
+    pair_currents,
     steady_half,
 )
 
 I_A = 10.0
+PAIR_A = (1.5, 3.0)
 PERIOD_S = 1e-4
 
 
@@ -71,15 +72,22 @@ class LateDrive:
 @pytest.mark.parametrize("windows", [1, 3])
 def test_a_window_waits_until_the_current_is_there(windows: int) -> None:
     drive = LateDrive(0.02, windows)
-    rows = hold_pairs(drive, I_A, 1.5, 0.0)  # type: ignore[arg-type]
-    assert rows["i_d_a"] == pytest.approx([share * I_A for share in PAIR_SHARES] * 3, rel=PAIR_ARRIVED)
+    rows = hold_pairs(drive, PAIR_A, 1.5, 0.0)  # type: ignore[arg-type]
+    assert rows["i_d_a"] == pytest.approx([*PAIR_A] * 3, rel=PAIR_ARRIVED)
     assert drive.taken == 6 * (windows + 1)
 
 
 def test_a_current_that_is_there_takes_one_window() -> None:
     drive = LateDrive(0.5 * PAIR_ARRIVED, 99)
-    hold_pairs(drive, I_A, 1.5, 0.0)  # type: ignore[arg-type]
+    hold_pairs(drive, PAIR_A, 1.5, 0.0)  # type: ignore[arg-type]
     assert drive.taken == 6
+
+
+def test_pairs_are_held_at_currents_of_levels() -> None:
+    levels = (0.2, -0.2, 1.2, -1.2, 2.8, 3.5, 10.0, -10.0)
+    assert pair_currents(levels, I_A) == (1.2, 2.8)
+    assert pair_currents(levels, 5.0) == (0.2, 1.2)  # a supply that gave way allows less than the levels had
+    assert pair_currents(levels, 1.0) == pytest.approx((0.15, 0.3))
 
 
 class RippledDrive(LateDrive):
@@ -102,7 +110,7 @@ class RippledDrive(LateDrive):
 
 def test_windows_of_pairs_are_whole_periods_of_a_links_ripple() -> None:
     """512 periods of 0.1 ms left 0.34 % of a voltage, 2 % of a slope."""
-    pairs = hold_pairs(RippledDrive(), I_A, 1.5, 0.0)  # type: ignore[arg-type]
+    pairs = hold_pairs(RippledDrive(), PAIR_A, 1.5, 0.0)  # type: ignore[arg-type]
     assert pairs["u_d_v"] == pytest.approx(pairs["i_d_a"], rel=1e-6)
     assert pairs.meta["samples"] == 1000 and pairs["u_d_change_v"] == pytest.approx(np.zeros(6), abs=1e-6)
 
@@ -156,10 +164,10 @@ def test_a_vector_that_is_led_on_reaches_every_angle_forward() -> None:
     quarters = levels["theta_imposed_rad"] / DC_ANGLE_RAD
     assert quarters == pytest.approx([1.0, 1.0, 3.0, 3.0, 5.0])
     assert "theta_imposed_rad" not in hold_levels(LateDrive(0.0, 0), replace(plan, quick=False)).signals  # type: ignore[arg-type]
-    pairs = hold_pairs(LateDrive(0.0, 0), I_A, 1.5, 3.0 * DC_ANGLE_RAD, quick=True)  # type: ignore[arg-type]
+    pairs = hold_pairs(LateDrive(0.0, 0), PAIR_A, 1.5, 3.0 * DC_ANGLE_RAD, quick=True)  # type: ignore[arg-type]
     assert np.degrees(pairs["theta_imposed_rad"]) == pytest.approx([270.0, 270.0, 330.0, 330.0, 390.0, 390.0])
     assert pairs.meta["idle"] == list("aaccbb"), "the same pairs as on 90, 330 and 210 degrees, with the other sign"
-    assert hold_pairs(LateDrive(0.0, 0), I_A, 1.5, 0.0).meta["idle"] == list("aabbcc")  # type: ignore[arg-type]
+    assert hold_pairs(LateDrive(0.0, 0), PAIR_A, 1.5, 0.0).meta["idle"] == list("aabbcc")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("ripple", "samples"), [(0.0, 400), (0.036, 1000)])
