@@ -29,6 +29,7 @@ from pmsmtool.estimators.flux.voltage_flux import (
     voltage_drift,
 )
 from pmsmtool.estimators.injection import inductance, sampling_instant
+from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.inductance import _pulse_height
 from pmsmtool.estimators.injection.sampling_instant import Sampling
 from pmsmtool.estimators.inverter_error import InverterCurve, Modulation, curve_from_levels
@@ -253,12 +254,30 @@ def test_a_resistance_of_nothing_is_none() -> None:
 @pytest.mark.parametrize("lines", [0, 1, 5])
 def test_a_fit_is_made_again_while_a_line_is_left(monkeypatch: pytest.MonkeyPatch, lines: int) -> None:
     """Whatever its chi-square: 1.8 of it was ripple of a link, and eddy currents took it for theirs."""
-    fit, made = SimpleNamespace(chi2=1.0, residuals=[np.zeros(1)]), []
+    fit, made = SimpleNamespace(chi2=1.0, residuals=[np.zeros(1)], motion_per_f=9.0), []
     monkeypatch.setattr(inductance, "fit_axis", lambda *_, **__: made.append(1) or fit)
     monkeypatch.setattr(inductance, "with_line", lambda shot, _: min(shot + 1, lines))
     shots = {axis: [cast(Any, 0)] for axis in "dq"}
     assert inductance._fitted(shots, 0.1, 1.0, None, None) == {"d": fit, "q": fit}
     assert len(made) == 2 * (1 + min(lines, inductance.LINES_MOST))
+
+
+@pytest.mark.parametrize(("moved", "again"), [(12.0, False), (11.9, True), (8.1e1, True)])
+def test_a_rotor_that_does_not_follow_as_pushes_say_is_fitted_without_them(
+    monkeypatch: pytest.MonkeyPatch, moved: float, again: bool
+) -> None:
+    """Friction holds it: L_q of a motor of 1.2 A came out 50 % too large. The d axis moves nothing."""
+    made: list[tuple[bool, Motion | None]] = []
+
+    def fit_axis(*_: object, torque: bool, motion: Motion | None = None, **__: object) -> SimpleNamespace:
+        made.append((torque, motion))
+        return SimpleNamespace(residuals=[np.zeros(1)], motion_per_f=moved if torque else 0.0)
+
+    monkeypatch.setattr(inductance, "fit_axis", fit_axis)
+    monkeypatch.setattr(inductance, "with_line", lambda shot, _: shot)
+    said = Motion(30.0, 6.0)
+    inductance._fitted({axis: [cast(Any, 0)] for axis in "dq"}, 0.1, 1.0, said, None)
+    assert made == [(False, said), (True, said), *[(True, None)] * again]
 
 
 def test_a_q_current_of_the_least_share_is_one() -> None:

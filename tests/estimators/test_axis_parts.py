@@ -84,7 +84,7 @@ def _exact(L_h: float, R_ohm: float, lag_s: float, h: float) -> Array:
 @pytest.mark.parametrize("lag_s", [0.0, 3e-5, 2e-4])
 @pytest.mark.parametrize("h", [0.2e-4, 0.9e-4])
 def test_one_step_of_current_and_sensor(R_ohm: float, lag_s: float, h: float) -> None:
-    a, b, e, c, d = output_error._advance(AxisModel(L_H, R_ohm, 1.0, lag_s), h)
+    a, b, e, c, d = AxisModel(L_H, R_ohm, 1.0, lag_s).advance(h)
     exact = _exact(L_H, R_ohm, lag_s or 1e-9, h)
     assert (a, b) == pytest.approx((exact[0, 0], exact[0, 2]), rel=EXACT)
     if lag_s:
@@ -130,6 +130,9 @@ def test_the_inductance_of_the_flux_is_the_slope_of_the_impedance() -> None:
     s = 1e-8j
     admittance = 1.0 / (R + s * L_H) + model.eddy_s / L_H / (1.0 + s * model.eddy_tau_s)
     assert model.flux_inductance_h == pytest.approx((1.0 / admittance).imag / s.imag, rel=EXACT)
+    Y = 1.0 / (R + 2e3j * L_H) + model.eddy_s / L_H / (1.0 + 2e3j * model.eddy_tau_s)
+    assert (1.0 - model.fall(2e3)) * model.flux_inductance_h == pytest.approx((1.0 / Y).imag / 2e3, rel=EXACT)
+    assert replace(model, eddy_s=0.0).fall(2e3) == pytest.approx(0.0, abs=EXACT) and model.fall(2e3) > 0.07
     assert bend(np.array([2.0, -3.0]), 0.5, 0.1).tolist() == pytest.approx([2.0 + 0.8, 4.5 - 2.7])
     assert cmath.isfinite(admittance)
 
@@ -197,9 +200,7 @@ def test_the_fast_charge_is_a_sum_of_trapezoids() -> None:
 @pytest.mark.parametrize("R_ohm", [0.0, R, -0.3])
 def test_the_pole_and_the_gain_of_one_period(R_ohm: float) -> None:
     exact = _exact(L_H, R_ohm, 1.0, T_S)
-    assert axis_response._step(AxisModel(L_H, R_ohm, 1.0, 0.0), T_S) == pytest.approx(
-        (exact[0, 0], exact[0, 2]), rel=EXACT
-    )
+    assert AxisModel(L_H, R_ohm, 1.0, 0.0).advance(T_S)[:2] == pytest.approx((exact[0, 0], exact[0, 2]), rel=EXACT)
 
 
 def test_without_further_effects_a_shot_is_the_response() -> None:

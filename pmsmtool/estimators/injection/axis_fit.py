@@ -54,6 +54,9 @@ DECIDED = -2.0 * math.log(NEGLIGIBLE_WEIGHT)
 LEAST_R = 0.8
 """Resistance beside eddy currents, of the loop's, below which they stand for something else: with 0.2 to 0.7 of it, and
 time constants of 13 periods, the ripple of a link put L 13 to 40 % off."""
+MOST_FALL = 0.15
+"""Part of L that eddy currents hide at the lowest injection frequency, above which they stand for something else: iron
+loss of 3 to 8 % hid 2 to 5 %; 26 % stood for a phase current within the inverter's knee, and L_q 49 % off."""
 MOST_R = 1.25
 """Resistance, of the loop's or of a model with eddy currents that fits, above which a model without them stands for
 them: with 1.4 to 3.6 of it, and an L that falls with the frequency, branches of 3 to 7 % put L 2.6 to 5.5 % off."""
@@ -330,7 +333,9 @@ def _average(
     # a rotor cannot push back: where the data alone decide, such a model fitted something else. A value that other
     # experiments put near zero scatters to both sides of it, and is in every model. Eddy currents drive nothing
     firsts = [(row, row[2].responses(row[1].x)[0]) for row in rows]
-    rows = [row for row, at in firsts if at.model.eddy_s >= 0.0 and (row[2].motion is not None or at.motion >= 0.0)]
+    firsts = [(row, at) for row, at in firsts if row[2].motion is not None or at.motion >= 0.0]
+    seen_rad_s = math.pi / (shots[-1].half_period * shots[-1].period_s)
+    rows = [row for row, at in firsts if at.model.eddy_s >= 0.0 and at.model.fall(seen_rad_s) < MOST_FALL]
     rows = [row for row in rows if not row[0].eddy or row[1].x[1] > LEAST_R]
     most_R = most_resistance(rows)
     rows = [row for row in rows if row[0].eddy or row[1].x[1] < most_R]

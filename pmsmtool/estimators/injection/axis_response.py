@@ -147,7 +147,7 @@ def simulate(responses: Sequence[Response], shot: Shot, slow: NDArray[np.float64
     curved, moves = bool(np.any(c_2) or np.any(c_3)), bool(np.any(motion))
     if not curved and not moves and shot.error is None:
         return linear[:, -count - 1 : -1]
-    steps = [_step(response.model, T_s) for response in responses]
+    steps = [response.model.advance(T_s)[:2] for response in responses]
     # the slow part of the modelled current stands for nothing: the starting current alone decides it
     y = linear
     fast = fast_part(y, slow)
@@ -167,12 +167,6 @@ def simulate(responses: Sequence[Response], shot: Shot, slow: NDArray[np.float64
     i = y + bend(fast, c_2, c_3) if curved else y
     # sample n - 1 of the record is the last but one of the response
     return i[:, -count - 1 : -1]
-
-
-def _step(model: AxisModel, T_s: float) -> tuple[float, float]:
-    """Pole of the current over one period, and current per constant voltage (1/ohm)."""
-    rate = model.R_ohm * T_s / model.L_h
-    return math.exp(-rate), T_s / model.L_h * (-math.expm1(-rate) / rate if abs(rate) > 1e-9 else 1.0)
 
 
 def projected(rows: NDArray[np.float64], slow: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -46,6 +47,8 @@ with 2 kohm of iron loss, where L_q came out 12 % wrong, 41)."""
 CHI2_HOPELESS = 300.0
 """Reduced chi-square above which no number is given. Between it and the usual limit the interval is widened (ripple of
 3 % of a DC link: 37, L_d 0.1 % off) ..."""
+FOLLOWS_WITHIN = 3.0
+"""Standard deviations from what pushes say of a rotor's motion beyond which friction holds it, and the fit is free."""
 LINES_MOST = 2
 """Sines beside the injection that are taken out of a record, one after the other."""
 IN_STEP = 0.2
@@ -323,11 +326,12 @@ def _fitted(
     """Fit both axes, d first; where a fit leaves sines that are not the injection's, again without these."""
     fits: dict[str, AxisFit] = {}
     for axis in "dq":
+        torque, d = axis == "q", fits.get("d")
+        fit = partial(fit_axis, sigma_a=sigma_a, R_guess=R_ohm, torque=torque, other=d, instant=instant)
         for _ in range(LINES_MOST + 1):
-            fits[axis] = fit_axis(
-                shots[axis], sigma_a, R_ohm, torque=axis == "q", motion=motion, other=fits.get("d") if axis == "q"
-                else None, instant=instant,
-            )  # fmt: skip
+            fits[axis] = fit(shots[axis], motion=motion)
+            if motion and torque and abs(fits[axis].motion_per_f - motion.per_f) > FOLLOWS_WITHIN * motion.std_per_f:
+                motion, fits[axis] = None, fit(shots[axis])
             found = [with_line(shot, r) for shot, r in zip(shots[axis], fits[axis].residuals, strict=True)]
             if all(new is old for new, old in zip(found, shots[axis], strict=True)):
                 break
@@ -424,16 +428,14 @@ def _shot(trace: Trace, axis: str, inverter: InverterCurve | None, U_dc_v: float
     way = math.degrees(rotor_way(float(trace.meta["pole_pairs"]) * trace["theta_M_rad"]))
     if way > (most := math.degrees(ROTOR_LIMIT_RAD)):
         raise refuse("E_ROTOR_MOVED", f"the rotor moved by {way:.2g} deg (electrical), limit {most:g} deg", stage=stage)
-    other = "q" if axis == "d" else "d"
-    i, cross = trace[f"i_{axis}_a"], trace[f"i_{other}_a"]
-    error = None
+    shot, error = bare_shot(trace, axis), None
     if inverter is not None:
+        i, across_a = shot.i_a, float(np.mean(shot.cross_a))
         margin = 0.2 * float(np.ptp(i))
         grid = np.linspace(float(np.min(i)) - margin, float(np.max(i)) + margin, CURVE_POINTS)
         frame = float(trace.meta["fixed_angle_rad"])
-        error = VoltageError(grid, *inverter.along_axis(frame, axis, grid, float(np.mean(cross)), float(np.mean(i))))
-    height_v = _pulse_height(float(trace.meta["fixed_angle_rad"]), axis, U_dc_v)
-    return Shot(trace[f"u_{axis}_v"], i, cross, half_period, trace.period_s, error, height_v)
+        error = VoltageError(grid, *inverter.along_axis(frame, axis, grid, across_a, float(np.mean(i))))
+    return replace(shot, error=error, pulse_v=_pulse_height(float(trace.meta["fixed_angle_rad"]), axis, U_dc_v))
 
 
 def _pulse_height(frame_rad: float, axis: str, U_dc_v: float) -> float:

@@ -35,8 +35,6 @@ WIDTHS_TO_POWERS = np.linalg.inv(np.vander(WIDTH_NODES, increasing=True))
 the effect)."""
 LEAST_SPREAD = 1e-6
 """Spread of the widths below which they are calculated one by one (1)."""
-SMALLEST_RATE = 1e-9
-"""R T_s/L below which the limit of a pure inductance is used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,6 +70,22 @@ class AxisModel:
         """
         shunt = self.eddy_s / self.L_h
         return (self.L_h + shunt * self.eddy_tau_s * self.R_ohm**2) / (1.0 + shunt * self.R_ohm) ** 2
+
+    def fall(self, omega_rad_s: float) -> float:
+        """Part of that inductance which is not seen at an angular frequency (1)."""
+        s = 1j * omega_rad_s
+        Y = 1.0 / (self.R_ohm + s * self.L_h) + self.eddy_s / self.L_h / (1.0 + s * self.eddy_tau_s)
+        return 1.0 - (1.0 / Y).imag / omega_rad_s / self.flux_inductance_h
+
+    def advance(self, h: float) -> tuple[float, float, float, float, float]:
+        """Coefficients of one step of length h: i' = a i + b u, y' = e y + c i + d u."""
+        rate = self.R_ohm / self.L_h
+        a, (b, d) = math.exp(-rate * h), _stepped(self, np.array(h)).tolist()
+        if self.lag_s <= 0.0:
+            return a, b, 0.0, a, d
+        mu = 1.0 / self.lag_s
+        e = math.exp(-mu * h)
+        return a, b, e, mu * (a - e) / (mu - rate), d
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,27 +141,6 @@ def acting_voltages(command: Array, delay: float) -> tuple[Array, Array, float]:
     return early, late, fraction
 
 
-def _advance(model: AxisModel, h: float) -> tuple[float, float, float, float, float]:
-    """Coefficients of one step of length h: i' = a i + b u, y' = e y + c i + d u."""
-    rate = model.R_ohm / model.L_h
-    if abs(rate * h) < SMALLEST_RATE:
-        a, b = 1.0, h / model.L_h
-        conductance_ratio = 0.0
-    else:
-        a = math.exp(-rate * h)
-        b = -math.expm1(-rate * h) / model.R_ohm
-        conductance_ratio = 1.0 / model.R_ohm
-    if model.lag_s <= 0.0:
-        return a, b, 0.0, a, b
-    mu = 1.0 / model.lag_s
-    e = math.exp(-mu * h)
-    if conductance_ratio == 0.0:
-        c = -math.expm1(-mu * h)
-        return a, b, e, c, (h + math.expm1(-mu * h) / mu) / model.L_h
-    c = mu * (a - e) / (mu - rate)
-    return a, b, e, c, (1.0 - e - c) * conductance_ratio
-
-
 def respond(model: AxisModel, command: Array, period_s: float, start_a: float, pulses: Pulses | None = None) -> Array:
     """Measured current from the first modelled sample on, shape (n - first + 1,), in equilibrium at ``start_a``.
 
@@ -167,8 +160,8 @@ def respond(model: AxisModel, command: Array, period_s: float, start_a: float, p
     if pulses is not None:
         return _respond_to_pulses(model, pulses, period_s, start_a)
     early, late, fraction = acting_voltages(command, model.delay)
-    a_1, b_1, e_1, c_1, d_1 = _advance(model, fraction * period_s)
-    a_2, b_2, e_2, c_2, d_2 = _advance(model, (1.0 - fraction) * period_s)
+    a_1, b_1, e_1, c_1, d_1 = model.advance(fraction * period_s)
+    a_2, b_2, e_2, c_2, d_2 = model.advance((1.0 - fraction) * period_s)
     # i after both parts, then y after both parts with the current in between eliminated
     current = recursion(a_1 * a_2, a_2 * b_1 * early + b_2 * late, start_a)
     if model.lag_s <= 0.0:
@@ -196,7 +189,7 @@ def _respond_to_pulses(model: AxisModel, pulses: Pulses, period_s: float, start_
     early_v, late_v, fraction = acting_voltages(pulses.height_v, model.delay)
     early_w, late_w, _ = acting_voltages(pulses.share, model.delay)
     begun = 1.0 - fraction  # of the early command's period, at the sample
-    a, b, e, c, d = _advance(model, period_s)
+    a, b, e, c, d = model.advance(period_s)
     forced = np.full((2, len(early_v)), pulses.rest_v) * np.array([[b], [d]])
     for height, share, gone in ((early_v, early_w, begun), (late_v, late_w, begun - 1.0)):
         forced += height * _charged(model, share, gone, period_s)
