@@ -30,8 +30,8 @@ from pmsmtool.estimators.estimate import (
     chi2_gate,
     condition_gate,
     coverage_factor,
-    information_bound,
     information_weights,
+    scaled_covariance,
 )
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt, linear_solve
 from pmsmtool.estimators.shaft.disturbances import NONE, TILT_FLOOR, Extent, disturbances, encoder_prior
@@ -229,40 +229,36 @@ def estimate_mechanics(
     others, of_it = np.delete(with_drag.jacobian, SHAFT, axis=1), with_drag.jacobian[:, SHAFT] * with_drag.x[SHAFT]
     start = np.delete(with_drag.x, SHAFT) + np.linalg.lstsq(others, of_it, rcond=None)[0]
     without = _minimum(noisy, start, sizes_of(blocks))
-    bound, condition = information_bound(without.jacobian)
+    covariance, condition = scaled_covariance(without.jacobian)
     condition_gate(condition, "B and tau_c", STAGE, SEPARABLE)
     _, widen = chi2_gate(chi2, STAGE)
-    share = float(information_weights([without.cost, with_drag.cost + DRAG_PENALTY])[1])
+    x, more = _held_at_zero(without.x[:SHAFT], covariance[:SHAFT, :SHAFT], (1, 2))
+    of_drag = scaled_covariance(with_drag.jacobian)[0][: SHAFT + 1, : SHAFT + 1]
+    x_drag, more_drag = _held_at_zero(with_drag.x[: SHAFT + 1], of_drag, (SHAFT, 1, 2))  # B often takes what it was
+    criteria = without.cost + more, with_drag.cost + more_drag + DRAG_PENALTY
+    share = float(information_weights(criteria)[1]) * (x_drag[SHAFT] > 0.0)
     if elastic:  # so much noise may hide a drag: what it may be is then in the intervals of B and tau_c
         share = max(share, 0.5)
-    of_drag, _ = information_bound(with_drag.jacobian)
     # friction that falls with the speed is no viscous one: a drag beside it fits the dip of Stribeck's curve, and is
-    # 76 N m at the rated speed of a shaft with 1 N m of friction; a drag below zero would turn it (2.2 N m, ten times
-    # the friction, at 13 times the speed of the pushes). Neither model is the shaft's
-    falls = with_drag.x[1] < -COVERAGE_FACTOR * widen * float(of_drag[1])
-    share = min(share, 0.5) if falls or with_drag.x[SHAFT] < 0.0 else share
-    values, deviations = [], []
-    for k in range(SHAFT):
-        pair = without.x[k], with_drag.x[k]
-        own = (1.0 - share) * float(bound[k]) ** 2 + share * float(of_drag[k]) ** 2
-        spread = share * (1.0 - share) * float(pair[1] - pair[0]) ** 2
-        values.append(float((1.0 - share) * pair[0] + share * pair[1]))
-        deviations.append(widen * math.sqrt(own + spread))
-    J, B, tau_c = math.exp(values[0]), values[1], values[2]
-    stds = (J * deviations[0], deviations[1], deviations[2])
+    # 76 N m at the rated speed of a shaft with 1 N m of friction. Half of what it moves the others by is a deviation
+    falls = more_drag > (COVERAGE_FACTOR * widen) ** 2
+    apart, moved = x_drag[:SHAFT] - x, 0.5 * falls * (with_drag.x[:SHAFT] - x_drag[:SHAFT])
+    ln_J, B, tau_c = (x + share * apart).tolist()
+    own = (1.0 - share) * np.diag(covariance)[:SHAFT] + share * np.diag(of_drag)[:SHAFT]
+    deviations = (widen * np.sqrt(own + share * (1.0 - share) * apart**2 + moved**2)).tolist()
+    J, stds = math.exp(ln_J), (math.exp(ln_J) * deviations[0], deviations[1], deviations[2])
     require_useful(noisy, stds[1], stds[2])
     drag = None
     if share > 0.5:
-        drag = Estimate(float(with_drag.x[SHAFT]), widen * float(of_drag[SHAFT]), 0.0, "N m s2", method=METHOD)
+        drag = Estimate(float(x_drag[SHAFT]), widen * math.sqrt(of_drag[SHAFT, SHAFT]), 0.0, "N m s2", method=METHOD)
     n = sum(len(block.theta) for block in blocks)
     scale_std = math.hypot(scale_std, SCALE_FLOOR)
-    estimates = [
+    J_found, B_found, tau_found = (
         Estimate(value, math.hypot(std, scale_std * value), tolerance.inertia * abs(value), unit, n=n, chi2=chi2,
-                 method=METHOD)
-        for value, std, unit in zip((J, B, tau_c), stds, MEANS.values(), strict=True)
-    ]  # fmt: skip
+                 method=METHOD, fallback="" if value else f"held at zero: the fit alone has {alone:.2g} {unit}")
+        for value, std, unit, alone in zip((J, B, tau_c), stds, MEANS.values(), without.x, strict=False)
+    )  # fmt: skip
     ripple, unexplained = max(_noise(noisy).values()), _unexplained(blocks, noisy)
-    J_found, B_found, tau_found = estimates
     return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, unexplained, harmonics, drag)
 
 
@@ -272,7 +268,7 @@ def mean_mechanics(
     """Return inertia and friction by their keys, from a regression of mean torques on mean motions.
 
     Of pushes and halves of coasting: what swings or strikes within is in no mean. As :func:`estimate_mechanics`; no
-    friction that may be more than what turned the shaft, and no B below zero: nothing drives it the faster it turns.
+    friction that may be more than what turned the shaft.
     """
     runs = [_fast(_window(run)) for run in runs]
     step = encoder_step([run["theta_M_rad"] for run in runs])
@@ -282,8 +278,7 @@ def mean_mechanics(
     stds = (student * np.sqrt(np.diag(covariance))).tolist()
     if not values[0] > 0.0:
         return {}
-    if values[1] < 0.0:
-        values = values - covariance[:, 1] * (values[1] / covariance[1, 1])  # least squares with B = 0
+    values, _ = _held_at_zero(values, covariance, (1, 2))
     if COVERAGE_FACTOR * max(stds[1] * fastest(blocks), stds[2]) > largest_torque(blocks):
         values = values[:1]
     scale, systematic = math.hypot(MEAN_STD, scale_std), (tolerance or SensorTolerance()).inertia
@@ -291,6 +286,17 @@ def mean_mechanics(
         key: Estimate(v, math.hypot(std, scale * v), systematic * abs(v), unit, n=len(runs), method=MEAN_METHOD)
         for v, std, (key, unit) in zip(values.tolist(), stds, MEANS.items(), strict=False)
     }
+
+
+def _held_at_zero(x: Array, covariance: NDArray[np.float64], friction: Sequence[int]) -> tuple[Array, float]:
+    """Return least squares with friction at zero that came out below it, where it would drive, and their added cost."""
+    cost = 0.0
+    for k in friction:
+        if x[k] < 0.0:
+            column = covariance[:, k] / covariance[k, k]
+            cost += float(x[k]) ** 2 / float(covariance[k, k])
+            x, covariance = x - column * x[k], covariance - np.outer(column, covariance[k])
+    return np.append(x[:1], np.maximum(x[1:], 0.0)), cost
 
 
 def require_useful(runs: Sequence[Run], B_std: float, tau_std: float) -> None:
