@@ -4,7 +4,7 @@
 import tomllib
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pmsmtool.toml_file import toml_lines, toml_text, toml_value
@@ -18,7 +18,9 @@ TABLES = st.recursive(
 )
 
 
+# a loaded computer makes too few tables a second for the check of the health
 @pytest.mark.chain
+@settings(suppress_health_check=[HealthCheck.too_slow], max_examples=60)
 @given(TABLES)
 def test_reads_back(tables):
     assert tomllib.loads(toml_text(tables)) == tables

@@ -38,7 +38,7 @@ WITH_OWN_OBJECTS = [
     name for name in HOLDING if any(cell.index not in STANDARD for cell in load_family(name).cells.values())
 ]
 """Families that hold more than the limits of CiA 402."""
-DESIGNS, WRITTEN_OF = 1000, 5
+DESIGNS, WRITTEN_OF = 250, 5
 
 
 @contextmanager
@@ -109,7 +109,7 @@ def torque_of(design: dict[str, float], drive_map: DriveMap) -> dict[str, float]
 @pytest.mark.chain
 @pytest.mark.parametrize("family", HOLDING)
 def test_what_is_shown_before_is_what_the_drive_holds(family: str) -> None:
-    """1000 random designs: bytes and the SI values they mean; of every fifth also what the drive reads back."""
+    """Random designs: bytes and the SI values they mean; of every fifth also what the drive reads back."""
     rng = np.random.default_rng([7, len(family), ord(family[0])])
     with opened(family) as node:
         drive_map, parameters = node.map, DriveParameters(node)

@@ -127,7 +127,7 @@ def test_a_prefix_that_is_no_c_name_is_refused(prefix: str) -> None:
 
 
 @pytest.mark.chain
-@settings(max_examples=2000)
+@settings(max_examples=500)
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 def test_a_literal_reads_back_to_the_same_bits(value: float) -> None:
     text = c_float(value)

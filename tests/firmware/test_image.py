@@ -34,7 +34,7 @@ from pmsmtool.sim.node.parameter_set import ParameterImage
 DEFAULTS = {row.name: row.default for row in CATALOGUE}
 CELLS = reference_map().cells
 """What the tool writes to the objects of the reference drive."""
-RANDOM_SETS = 3000
+RANDOM_SETS = 1000
 
 
 def random_value(row: Parameter, choice: int, share: float) -> float:

@@ -15,7 +15,7 @@ from tests.firmware.governor_rows import Table1, paper_rows
 
 Row = tuple[np.ndarray, np.ndarray, float]
 EMPTY = 255
-INSTANCES = 300
+INSTANCES = 200
 """Of them the general solver takes 5 ms each; 1000 had the same largest distance."""
 DISTANCE_DOUBLE = 1e-7  # A; measured 1.1e-9
 DISTANCE_FLOAT = 2e-3  # A; measured 1.4e-4

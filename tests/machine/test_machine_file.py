@@ -335,7 +335,7 @@ TABLES = st.fixed_dictionaries(
 
 
 @pytest.mark.chain
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=75, deadline=None)
 @given(TABLES, ESTIMATES)
 def test_any_machine_survives_its_file(tables, estimate):
     first = machine_from_tables(tables)
