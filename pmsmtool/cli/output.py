@@ -106,18 +106,12 @@ def coloured(text: str, label: str = "") -> str:
 
 @dataclasses.dataclass(slots=True)
 class Output:
-    """The only way a command prints.
-
-    Parameters
-    ----------
-    json : bool
-        Print one JSON object instead of text.
-    verbosity : int
-        -1 quiet, 0 normal, 1 (``-v``) details, 2 (``-vv``) logs and tracebacks.
-    """
+    """The only way a command prints."""
 
     json: bool = False
+    """Print one JSON object instead of text."""
     verbosity: int = 0
+    """-1 quiet, 0 normal, 1 (``-v``) details, 2 (``-vv``) logs and tracebacks."""
     _status_width: int = 0
 
     def result(self, command: str, data: Mapping[str, Any], text: Iterable[str] | Callable[[], Iterable[str]]) -> None:

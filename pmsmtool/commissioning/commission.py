@@ -133,50 +133,35 @@ def _check_unchanged(run: RunDirectory, expected: Mapping[str, str], rewritten: 
 
 @dataclass(slots=True)
 class Commissioning:
-    """One run of the chain.
-
-    Parameters
-    ----------
-    run : RunDirectory
-        Where everything goes; its record names the drive.
-    drive : CanopenDrive
-        The drive; off.
-    person : Person
-        Gives the two consents.
-    progress : Progress
-        Is told.
-    nameplate : MachineFile, optional
-        What is known of the machine; the drive's own ratings and set when not given.
-    identify, tune, lookup, margins, prove
-        What is asked.
-    capabilities : Capabilities, optional
-        What a drive below the full level has: its stages run as far as that goes, and those that cannot run are
-        recorded as not available. Without, everything is expected, and the chain ends where something is missing.
-    drive_bandwidth_hz : float, optional
-        Bandwidth of the current control of a drive that keeps its own.
-    accept_contradictions : tuple of str
-        Quantities of the machine file whose contradiction a person accepts.
-    require : tuple of str
-        Stages without which the run fails; kept in its record, so that they hold when it is resumed.
-    accept_limits : tuple of str
-        Limits of the design (:data:`~pmsmtool.commissioning.design_stages.NAMES`) accepted below the machine's ratings.
-    """
+    """One run of the chain."""
 
     run: RunDirectory
+    """Where everything goes; its record names the drive."""
     drive: CanopenDrive
+    """The drive; off."""
     person: Person
+    """Gives the two consents."""
     progress: Progress
+    """Is told."""
     nameplate: MachineFile | None = None
+    """What is known of the machine; the drive's own ratings and set when not given."""
     identify: IdentifyRequest = field(default_factory=IdentifyRequest)
     tune: TuneRequest = FROM_TABLE
     lookup: LookupRequest = field(default_factory=LookupRequest)
     margins: MarginRequest = field(default_factory=MarginRequest)
     prove: ProofRequest | None = None
+    """What is asked."""
     capabilities: Capabilities | None = None
+    """What a drive below the full level has: its stages run as far as that goes, and those that cannot run are
+    recorded as not available. Without, everything is expected, and the chain ends where something is missing."""
     drive_bandwidth_hz: float | None = None
+    """Bandwidth of the current control of a drive that keeps its own."""
     accept_contradictions: tuple[str, ...] = ()
+    """Quantities of the machine file whose contradiction a person accepts."""
     require: tuple[str, ...] = ()
+    """Stages without which the run fails; kept in its record, so that they hold when it is resumed."""
     accept_limits: tuple[str, ...] = ()
+    """Limits of the design that are accepted below the machine's ratings (``design_stages.NAMES``)."""
     _account: RunAccount | None = field(default=None, init=False)
 
     def carry_out(self) -> None:

@@ -65,27 +65,18 @@ FOR_READING = "the drive has no object for the table"
 
 @dataclass(frozen=True, slots=True)
 class LevelStages:
-    """The stages of one run on one drive.
-
-    Parameters
-    ----------
-    run : RunDirectory
-        Where everything goes.
-    drive : CanopenDrive
-        As ``identify.open_for_level`` gives it.
-    found : Capabilities
-        What the drive has.
-    nameplate : MachineFile or None
-        What is known of the machine.
-    drive_bandwidth_hz : float or None
-        Bandwidth of the current control of a drive that keeps its own, where it is known.
-    """
+    """The stages of one run on one drive."""
 
     run: RunDirectory
+    """Where everything goes."""
     drive: CanopenDrive
+    """As ``identify.open_for_level`` gives it."""
     found: Capabilities
+    """What the drive has."""
     nameplate: MachineFile | None
+    """What is known of the machine."""
     drive_bandwidth_hz: float | None = None
+    """Bandwidth of the current control of a drive that keeps its own, where it is known."""
 
     @property
     def whole(self) -> bool:

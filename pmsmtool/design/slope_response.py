@@ -109,34 +109,26 @@ class SlopeResponse:
     """Sums of absolute responses at m speeds, from which any bound follows.
 
     Rows of 6: i_d, i_q, u_d and u_q on their way, u_d and u_q demanded.
-
-    Attributes
-    ----------
-    omega_e : ndarray, shape (m,)
-        Speeds (rad/s), rising from 0; each stands for all within half a step.
-    stair : ndarray, shape (m, 6)
-        Per ampere of a stair of the reference.
-    drift : ndarray, shape (m, 6, 2)
-        Per rad/s2 of acceleration: per ampere of the reference; constant, from the magnet.
-    push, aged : ndarray, shape (m, 6, 4)
-        Of disturbances of the rows of i and of u on the way; ``aged``: each weighted with its age (s).
-    spread, by_speed : ndarray, shape (m, 4, 4)
-        |E| of the constants and of half a step of speed; |E| per rad/s.
-    demanded : ndarray, shape (m, 2, 2)
-        What half a step of speed changes in the command itself per ampere, where it is decoupled.
-    steady : ndarray, shape (m, n, 2, 2)
-        Steady command (d, q) at all ends of constants, speed step and flux: constant, and per ampere of i_q.
     """
 
     omega_e: Array
+    """Speeds (rad/s), rising from 0; each stands for all within half a step. Shape (m,)."""
     stair: Array
+    """Per ampere of a stair of the reference. Shape (m, 6)."""
     drift: Array
+    """Per rad/s2 of acceleration: per ampere of the reference; constant, from the magnet. Shape (m, 6, 2)."""
     push: Array
     aged: Array
+    """Of disturbances of the rows of i and of u on the way; ``aged``: each weighted with its age (s).
+    Shape (m, 6, 4)."""
     spread: Array
     by_speed: Array
+    """|E| of the constants and of half a step of speed; |E| per rad/s. Shape (m, 4, 4)."""
     demanded: Array
+    """What half a step of speed changes in the command itself per ampere, where it is decoupled. Shape (m, 2, 2)."""
     steady: Array
+    """Steady command (d, q) at all ends of constants, speed step and flux: constant, and per ampere of i_q.
+    Shape (m, n, 2, 2)."""
     _way: slice
 
     def largest_demand(self, I_apk: float, stair_a: float, acceleration: float, speeds: int) -> tuple[Array, float]:

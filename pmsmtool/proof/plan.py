@@ -115,51 +115,36 @@ MOST_WAY = 2**30
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """One record.
-
-    Attributes
-    ----------
-    name : str
-        ``speed_step``, ``q_steps``, ``d_steps``, ``unreachable``, ``weakening``, ``move``, ``move_lag``.
-    text : str
-        What happens, one line.
-    base_rad_s : float
-        Mechanical speed held before (rad/s).
-    excitation : Excitation
-        What is asked on top of it.
-    rows, decimation : int
-        Size of the record.
-    repeats : int
-        The record is this often the same pattern; it is averaged over them.
-    judged : tuple of str
-        Signals that have a band.
-    scale_a, scale_rad_s, scale_rad : float
-        Scale of its currents (A), of its electrical speed (rad/s) and of its following error (rad).
-    settle_s : float
-        Time at the speed held before, after it is reached (s).
-    steady_rows : int
-        So many rows at the end are steady: what they shake by is the machine's ripple.
-    move : ProfileMove or None
-        Instead of the excitation: a move by the position loop.
-    velocity_ff : float
-        Of the move's speed, share of what the design feeds forward; the drive is lent it for the record.
-    """
+    """One record."""
 
     name: str
+    """``speed_step``, ``q_steps``, ``d_steps``, ``unreachable``, ``weakening``, ``move``, ``move_lag``."""
     text: str
+    """What happens, one line."""
     base_rad_s: float
+    """Mechanical speed held before (rad/s)."""
     excitation: Excitation
+    """What is asked on top of it."""
     rows: int
     decimation: int
+    """Size of the record."""
     repeats: int = 1
+    """The record is this often the same pattern; it is averaged over them."""
     judged: tuple[str, ...] = ("i_d_a", "i_q_a")
+    """Signals that have a band."""
     scale_a: float = 1.0
     scale_rad_s: float = 1.0
+    """Scale of its currents (A), and of its electrical speed (rad/s)."""
     settle_s: float = 0.0
+    """Time at the speed held before, after it is reached (s)."""
     steady_rows: int = 0
+    """So many rows at the end are steady: what they shake by is the machine's ripple."""
     scale_rad: float = 1.0
+    """Scale of its following error (rad)."""
     move: ProfileMove | None = None
+    """Instead of the excitation: a move by the position loop."""
     velocity_ff: float = 1.0
+    """Of the move's speed, share of what the design feeds forward; the drive is lent it for the record."""
 
     @property
     def signals(self) -> tuple[str, ...]:

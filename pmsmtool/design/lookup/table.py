@@ -47,14 +47,9 @@ def binding_name(limits: int) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueLimits:
-    """Least and largest torque per speed and voltage, shape (n_speed, n_voltage); NaN: no admissible point.
+    """Least and largest torque (N m) per speed and voltage, and their currents (A peak); NaN: no admissible point.
 
-    Attributes
-    ----------
-    least_nm, largest_nm : ndarray
-        Torques (N m).
-    least_i_d_a, least_i_q_a, largest_i_d_a, largest_i_q_a : ndarray
-        Their currents (A peak).
+    All of shape (n_speed, n_voltage).
     """
 
     least_nm: Array

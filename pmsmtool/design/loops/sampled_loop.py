@@ -30,22 +30,15 @@ _POLISH_STEPS, _POLISHED = 60, 1e-15
 
 @dataclass(frozen=True, slots=True)
 class SampledLoop:
-    """Loop transfer function L(z) = num(z) / den(z), broken at the actuator, negative feedback.
-
-    Parameters
-    ----------
-    num, den : tuple of float
-        Coefficients, highest power of z first.
-    T_s : float
-        Sampling period (s).
-    delay_s : float
-        Delay from a sample to the mean action that L contains (s), for the statement only.
-    """
+    """Loop transfer function L(z) = num(z) / den(z), broken at the actuator, negative feedback."""
 
     num: tuple[float, ...]
     den: tuple[float, ...]
+    """Coefficients, highest power of z first."""
     T_s: float
+    """Sampling period (s)."""
     delay_s: float = 0.0
+    """Delay from a sample to the mean action that L contains (s), for the statement only."""
 
     def at(self, omega: float | Array) -> NDArray[np.complex128]:
         """Return L(exp(j omega T_s)) at angular frequencies (rad/s)."""
