@@ -95,41 +95,31 @@ _OTHER_SET_UP = "the drive is set up for another motor, or this is the data shee
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One quantity of the table *data sheet | drive | measured*.
-
-    Attributes
-    ----------
-    name, unit : str
-        Key of a machine file, or ``J_per_psi``, ``L_phase_h``, ``encoder_counts``.
-    stated, held, measured : float or None
-        What MACHINE states, the drive holds, this run measured (SI); None: it does not.
-    interval : float
-        95 % half width of the measured value.
-    low, high : float
-        What the stated value allows (NaN without one), and ``tolerance`` says by which tolerance.
-    factory : bool
-        Whether ``held`` is the drive's factory default.
-    source : str
-        Where ``stated`` comes from.
-    verdict : str
-        What that amounts to.
-    cause : str
-        Likely cause of a contradiction.
-    """
+    """One quantity of the table *data sheet | drive | measured*."""
 
     name: str
+    """Key of a machine file, or ``J_per_psi``, ``L_phase_h``, ``encoder_counts``."""
     unit: str
+    """Of its values."""
     stated: float | None = None
     held: float | None = None
     measured: float | None = None
+    """What MACHINE states, the drive holds, this run measured (SI); None: it does not."""
     interval: float = 0.0
+    """95 % half width of the measured value."""
     low: float = math.nan
     high: float = math.nan
+    """What the stated value allows; NaN without one."""
     tolerance: str = ""
+    """By which tolerance it does."""
     factory: bool = False
+    """Whether ``held`` is the drive's factory default."""
     source: str = DATA_SHEET
+    """Where ``stated`` comes from."""
     verdict: Verdict = "held"
+    """What that amounts to."""
     cause: str = ""
+    """Likely cause of a contradiction."""
 
     def facts(self) -> dict[str, Any]:
         """Return the row as a stage records it; what is not finite as None."""

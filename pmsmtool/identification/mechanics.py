@@ -62,36 +62,27 @@ one, of the largest, below which it is not looked at: there the current's step i
 
 @dataclass(frozen=True, slots=True)
 class Pushes:
-    """The traces of a run of pushes, and what turns their currents into torque.
-
-    Attributes
-    ----------
-    parts : list of Trace
-        Pushes with the mean currents of the periods, in the frame of the d axis, and coasting.
-    torque : callable
-        Torque (N m) of arrays of i_d, i_q (A).
-    scale_std, tilt_std : float
-        Relative standard deviations of its scale, and of what it is off at the fastest speed.
-    direction : int
-        Sign of the encoder's count along the phase order.
-    encoder : EncoderResult
-        Pole pairs, and the encoder's error once and twice per turn.
-    tolerance : SensorTolerance or None
-        Declared sensor tolerances.
-    drag_std_nms : float
-        What the displacement of the samples may make of B, of a shaft that coasts with the voltage on (N m s).
-    """
+    """The traces of a run of pushes, and what turns their currents into torque."""
 
     parts: list[Trace]
+    """Pushes with the mean currents of the periods, in the frame of the d axis, and coasting."""
     torque: Torque
+    """Torque (N m) of arrays of i_d, i_q (A)."""
     torque_per_a: float
+    """Of the q current (N m/A)."""
     sigma_a: float
+    """Noise of one sample of a current (A)."""
     scale_std: float
     tilt_std: float
+    """Relative standard deviations of the torque's scale, and of what it is off at the fastest speed."""
     direction: int
+    """Sign of the encoder's count along the phase order."""
     encoder: EncoderResult
+    """Pole pairs, and the encoder's error once and twice per turn."""
     tolerance: SensorTolerance | None
+    """Declared sensor tolerances."""
     drag_std_nms: float = 0.0
+    """What the displacement of the samples may make of B, of a shaft that coasts with the voltage on (N m s)."""
 
     def mechanics(self, *, elastic: bool = False) -> MechanicsResult:
         """Return inertia and friction; ``elastic``: take any torque that a rigid shaft does not explain for noise.

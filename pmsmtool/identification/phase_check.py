@@ -57,18 +57,12 @@ PAIRS = ("b-c", "c-a", "a-b")
 
 @dataclass(frozen=True, slots=True)
 class PhaseCheck:
-    """Result of the three vectors.
-
-    Attributes
-    ----------
-    currents_a : tuple of float
-        Current along each vector (A).
-    impedance_ohm : tuple of float
-        u/i along each vector, dead-time voltage included (ohm).
-    """
+    """Result of the three vectors."""
 
     currents_a: tuple[float, float, float]
+    """Current along each vector (A)."""
     impedance_ohm: tuple[float, float, float]
+    """u/i along each vector, dead-time voltage included (ohm)."""
 
 
 def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
@@ -141,24 +135,16 @@ def check_phases(vectors: Trace, noise: Noise) -> PhaseCheck:
 
 @dataclass(frozen=True, slots=True)
 class PairCheck:
-    """Result of the three pairs.
-
-    Attributes
-    ----------
-    resistance_ohm : tuple of float
-        Slope of the voltage with phase a, b and c idle (ohm).
-    mismatch : SensorMismatch
-        Gains of the current sensors over their mean.
-    judged : bool
-        Whether the rotor was at rest, so that their differences mean something.
-    std_ohm : float
-        Standard deviation of a difference between two slopes: noise, and legs that are not alike.
-    """
+    """Result of the three pairs."""
 
     resistance_ohm: tuple[float, float, float]
+    """Slope of the voltage with phase a, b and c idle (ohm)."""
     mismatch: SensorMismatch
+    """Gains of the current sensors over their mean."""
     judged: bool = True
+    """Whether the rotor was at rest, so that their differences mean something."""
     std_ohm: float = math.inf
+    """Standard deviation of a difference between two slopes: noise, and legs that are not alike."""
 
     @property
     def beyond_mean_ohm(self) -> tuple[float, float, float]:

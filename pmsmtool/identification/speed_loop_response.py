@@ -66,23 +66,17 @@ _STEPS = np.array([0.1, 0.1, 0.5, 1e-3, 1e-3])
 
 
 class Emf(NamedTuple):
-    """What the EMF takes from a current loop that does not feed it forward.
-
-    Attributes
-    ----------
-    share, share_std : float
-        Of the inertia, by which this seems larger below the corner, and its standard deviation.
-    corner_rad_s : float
-        Of the current loop's integral: R over L.
-    at_once : float or None
-        Share of the current asked for that flows before this integral acts, where torque pulses showed it: less than
-        one by the inverter's dead time, and by a slow current loop.
-    """
+    """What the EMF takes from a current loop that does not feed it forward."""
 
     share: float
+    """Of the inertia, by which this seems larger below the corner."""
     corner_rad_s: float
+    """Of the current loop's integral: R over L."""
     share_std: float = 0.0
+    """Standard deviation of the share."""
     at_once: float | None = None
+    """Share of the current asked for that flows before this integral acts, where torque pulses showed it: less than one
+    by the inverter's dead time, and by a slow current loop."""
 
 
 @dataclass(frozen=True, slots=True)

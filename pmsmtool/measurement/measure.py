@@ -111,54 +111,36 @@ def starting_gains(limits: Limits, accuracy: float | None = None) -> dict[str, f
 
 @dataclass(slots=True)
 class Measurement:
-    """One run of the experiments.
-
-    Parameters
-    ----------
-    drive : Drive
-        Guarded, and off.
-    limits : Limits
-        What may be used.
-    keep : callable
-        Stores a trace under its name as soon as it is there.
-    say : callable
-        Told one line per experiment.
-    ripple_share : float
-        Ripple of the injection, peak to peak, of the rated current.
-    held : bool
-        Whether the shaft is locked.
-    accuracy : float or None
-        Statistical 95 % half width, relative, of R, L and psi that is enough; None: all is collected.
-    map_if_saturated : bool
-        Whether a machine that saturates is mapped without being asked for it.
-    spent : callable or None
-        Seconds energised and copper loss so far (s, J), told after every stage.
-    turn_share : float
-        Current that turns the rotor over, of the test current; more where it did not follow.
-    limit_current : callable or None
-        Sets the drive's own current limit (A peak) and returns what it keeps; with it the limit is shown to act.
-    limit_speed : callable or None
-        The same of the speed limit (rad/s).
-    unproven : list of str
-        What a report says of limits that could not be shown to act.
-    predicted : callable or None
-        Told every prediction (``identification/request``) before the machine moves for it.
-    """
+    """One run of the experiments."""
 
     drive: Drive
+    """Guarded, and off."""
     limits: Limits
+    """What may be used."""
     keep: Callable[[str, Trace], None]
+    """Stores a trace under its name as soon as it is there."""
     say: Callable[[str], None]
+    """Told one line per experiment."""
     ripple_share: float = RIPPLE_SHARE
+    """Ripple of the injection, peak to peak, of the rated current."""
     held: bool = False
+    """Whether the shaft is locked."""
     accuracy: float | None = None
+    """Statistical 95 % half width, relative, of R, L and psi that is enough; None: all is collected."""
     map_if_saturated: bool = False
+    """Whether a machine that saturates is mapped without being asked for it."""
     spent: Callable[[], tuple[float, float]] | None = None
+    """Seconds energised and copper loss so far (s, J), told after every stage."""
     limit_current: LimitCurrent | None = None
+    """Sets the drive's own current limit (A peak) and returns what it keeps; with it the limit is shown to act."""
     limit_speed: LimitSpeed | None = None
+    """The same of the speed limit (rad/s)."""
     predicted: Callable[[dict[str, Any]], None] | None = None
+    """Told every prediction (``identification/request``) before the machine moves for it."""
     turn_share: float = TURN_SHARES[0]
+    """Current that turns the rotor over, of the test current; more where it did not follow."""
     unproven: list[str] = field(default_factory=list)
+    """What a report says of limits that could not be shown to act."""
     refused: dict[str, IdentificationError] = field(default_factory=dict)
     _kept: dict[str, Trace] = field(default_factory=dict)
     _effort: Effort = ALL

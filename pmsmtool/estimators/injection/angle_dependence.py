@@ -40,19 +40,13 @@ UNEVEN = 0.004
 
 @dataclass(frozen=True, slots=True)
 class AngleDependence:
-    """An inductance over the angle.
-
-    Attributes
-    ----------
-    mean : float
-        Of all angles, over that where it was measured; 1 where no change is seen.
-    spread : float
-        Largest deviation from the mean that was seen, and what the angles leave unseen of the mean (95 %), relative
-        to it; 0: none.
-    """
+    """An inductance over the angle."""
 
     mean: float
+    """Of all angles, over that where it was measured; 1 where no change is seen."""
     spread: float
+    """Largest deviation from the mean that was seen, and what the angles leave unseen of the mean (95 %), relative
+    to it; 0: none."""
 
 
 def over_angle(

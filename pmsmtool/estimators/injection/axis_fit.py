@@ -66,60 +66,42 @@ UNPHYSICAL = 1e9
 
 @dataclass(frozen=True, slots=True)
 class AxisFit:
-    """Result of one axis.
-
-    Attributes
-    ----------
-    L_h, std_h : float
-        Incremental inductance along the axis at the shortest half period, standard deviation before gates (H).
-    bound_h : float
-        Cramer-Rao bound of the best model (H).
-    L_by_shot_h : tuple of float
-        Inductance of each shot; all equal unless the data show a difference (H).
-    R_ohm : float
-        Effective resistance at the injection (ohm).
-    delay : float
-        Sample to acting voltage (T_s).
-    lag_s : float
-        Sensor time constant, 0 where the data do not ask for one (s); far below T_s only delay + lag/T_s is known.
-    motion_per_f : float
-        Back-EMF per charge of the moving rotor, 1.5 p^2 psi^2/J (1/F).
-    chi2 : float
-        Reduced chi-square of the best model.
-    residuals : tuple of ndarray
-        Whitened residual of the best model, per shot.
-    effects : tuple of str
-        Effects of the best model.
-    condition : float
-        Condition number of its scaled Jacobian.
-    timing : Timing
-        What the axis says about delay and lag, for the other one.
-    places : tuple of (float, float, float)
-        Information weight, delay (T_s) and lag (s) of every model that counts.
-    eddy_s, eddy_tau_s : float
-        Eddy currents of the best model, per voltage and 1/L (s), and their time constant; 0 where it has none.
-    bend_per_a : float
-        Relative change of the incremental inductance per current of the axis at the bias, by the best model (1/A).
-    """
+    """Result of one axis."""
 
     L_h: float
     std_h: float
+    """Incremental inductance along the axis at the shortest half period, standard deviation before gates (H)."""
     bound_h: float
+    """Cramer-Rao bound of the best model (H)."""
     L_by_shot_h: tuple[float, ...]
+    """Inductance of each shot; all equal unless the data show a difference (H)."""
     R_ohm: float
+    """Effective resistance at the injection (ohm)."""
     delay: float
+    """Sample to acting voltage (T_s)."""
     lag_s: float
+    """Sensor time constant, 0 where the data do not ask for one (s); far below T_s only delay + lag/T_s is known."""
     motion_per_f: float
+    """Back-EMF per charge of the moving rotor, 1.5 p^2 psi^2/J (1/F)."""
     chi2: float
+    """Reduced chi-square of the best model."""
     n: int
+    """Samples that the fit counts."""
     residuals: tuple[Array, ...]
+    """Whitened residual of the best model, per shot."""
     effects: tuple[str, ...]
+    """Effects of the best model."""
     condition: float
+    """Condition number of its scaled Jacobian."""
     timing: Timing
+    """What the axis says about delay and lag, for the other one."""
     places: tuple[tuple[float, float, float], ...] = ()
+    """Information weight, delay (T_s) and lag (s) of every model that counts."""
     eddy_s: float = 0.0
     eddy_tau_s: float = 1.0
+    """Eddy currents of the best model, per voltage and 1/L (s), and their time constant; 0 where it has none."""
     bend_per_a: float = 0.0
+    """Relative change of the incremental inductance per current of the axis at the bias, by the best model (1/A)."""
 
 
 @dataclass(frozen=True, slots=True)

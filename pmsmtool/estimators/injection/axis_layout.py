@@ -51,31 +51,22 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Delay and sensor lag as another axis of the same drive has shown them.
-
-    Attributes
-    ----------
-    total, total_std : float
-        Delay and lag together, of the models with a lag (T_s).
-    log_lag, log_lag_std : float
-        Logarithm of the lag in T_s, of the same models.
-    delay, delay_std : float
-        Delay of the model without lag (T_s).
-    lag_criterion, plain_criterion : float
-        Information criterion of the best model with lag, and of the one without.
-    bend_gain : float
-        What a bend of the magnetisation curve gained there in the criterion, 0 where it gained nothing.
-    """
+    """Delay and sensor lag as another axis of the same drive has shown them."""
 
     total: float
     total_std: float
+    """Delay and lag together, of the models with a lag (T_s)."""
     log_lag: float
     log_lag_std: float
+    """Logarithm of the lag in T_s, of the same models."""
     delay: float
     delay_std: float
+    """Delay of the model without lag (T_s)."""
     lag_criterion: float
     plain_criterion: float
+    """Information criterion of the best model with lag, and of the one without."""
     bend_gain: float = 0.0
+    """What a bend of the magnetisation curve gained there in the criterion, 0 where it gained nothing."""
 
     def criterion(self, lag: bool) -> float:
         """Criterion of the other axis's model with or without lag."""

@@ -34,18 +34,13 @@ class VoltageError:
     current, the slow commutation of a small one, happens at the falling edge, three quarters of a period after the
     sample. A leg that takes current in loses it at the rising edge, after one quarter. A slope of the error therefore
     looks like an inductance of +-slope T_s/4.
-
-    Attributes
-    ----------
-    i_a : ndarray, shape (n,)
-        Currents along the axis, increasing (A).
-    early_v, late_v : ndarray, shape (n,)
-        Errors of the legs that take current in, and of those that feed it out (V).
     """
 
     i_a: Array
+    """Currents along the axis, increasing (A). Shape (n,)."""
     early_v: Array
     late_v: Array
+    """Errors of the legs that take current in, and of those that feed it out (V). Shape (n,)."""
 
     def lost_v(self, i_a: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean error in each interval between samples of currents (V), shape (..., n - 1)."""
@@ -66,34 +61,23 @@ LINE_APART, LINE_FINER = 1.5, 16
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """One record of a square wave on one axis, frozen frame.
-
-    Attributes
-    ----------
-    u_v, i_a : ndarray, shape (n,)
-        Voltage computed and current sampled at each instant.
-    cross_a : ndarray, shape (n,)
-        Current of the other axis.
-    half_period : int
-        Samples between sign changes.
-    period_s : float
-        Control period (s).
-    error : VoltageError or None
-        Inverter error from the DC levels.
-    pulse_v : float
-        Voltage of the bridge's pulses along the axis (V); infinite: the mean voltage is taken for all of the period.
-    lines_hz : tuple of float
-        Frequencies that are not the injection's and count as slow: ripple of the DC link.
-    """
+    """One record of a square wave on one axis, frozen frame."""
 
     u_v: Array
     i_a: Array
+    """Voltage computed and current sampled at each instant. Shape (n,)."""
     cross_a: Array
+    """Current of the other axis. Shape (n,)."""
     half_period: int
+    """Samples between sign changes."""
     period_s: float
+    """Control period (s)."""
     error: VoltageError | None = None
+    """Inverter error from the DC levels."""
     pulse_v: float = math.inf
+    """Voltage of the bridge's pulses along the axis (V); infinite: the mean voltage is taken for all of the period."""
     lines_hz: tuple[float, ...] = ()
+    """Frequencies that are not the injection's and count as slow: ripple of the DC link."""
 
     @property
     def pulses(self) -> Pulses | None:

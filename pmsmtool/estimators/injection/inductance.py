@@ -77,60 +77,40 @@ ANISOTROPY_LIMIT = 0.03
 
 @dataclass(frozen=True, slots=True)
 class FrameAhead:
-    """Angle of the frozen frame ahead of the rotor's d axis during the shots of each axis (rad electrical).
-
-    Attributes
-    ----------
-    d_rad, q_rad : float
-        During the shots on d and on q: an injection may shake the rotor loose from its friction.
-    std_rad : float
-        Standard deviation of both (they share the encoder offset).
-    """
+    """Angle of the frozen frame ahead of the rotor's d axis during the shots of each axis (rad electrical)."""
 
     d_rad: float
     q_rad: float
+    """During the shots on d and on q: an injection may shake the rotor loose from its friction."""
     std_rad: float
+    """Standard deviation of both (they share the encoder offset)."""
 
 
 @dataclass(frozen=True, slots=True)
 class InductanceResult:
-    """Incremental inductances and what came with them.
-
-    Attributes
-    ----------
-    L_d, L_q : Estimate
-        Incremental inductances at the bias stated in the estimate (H).
-    axes : mapping of str to AxisFit
-        Fits of the frame's own axes, before the offset is undone.
-    delay : float
-        Sample to acting voltage, mean of both axes (T_s).
-    lag_s : float
-        Time constant of the current sensor (s).
-    frequency_dependent : tuple of str
-        Axes whose inductances differ by more than 1 % between the injection frequencies.
-    axis_angle_rad : float
-        Angle of the frame ahead of the d axis, from the cross responses; NaN for a round machine.
-    verdict : Verdict
-        ``warn`` above the chi-square limit or when frequency dependent.
-    sampling : Sampling or None
-        When and how currents are sampled, by the best model; None where the flux run did not show the instant.
-    samplings : tuple of (float, Sampling)
-        The same by every model that counts, with its weight.
-    apart_s : float
-        How far the instants of square waves and turning machine lie apart where they contradict each other, else 0 (s).
-    """
+    """Incremental inductances and what came with them."""
 
     L_d: Estimate
     L_q: Estimate
+    """Incremental inductances at the bias stated in the estimate (H)."""
     axes: Mapping[str, AxisFit]
+    """Fits of the frame's own axes, before the offset is undone."""
     delay: float
+    """Sample to acting voltage, mean of both axes (T_s)."""
     lag_s: float
+    """Time constant of the current sensor (s)."""
     frequency_dependent: tuple[str, ...]
+    """Axes whose inductances differ by more than 1 % between the injection frequencies."""
     axis_angle_rad: float
+    """Angle of the frame ahead of the d axis, from the cross responses; NaN for a round machine."""
     verdict: Verdict
+    """``warn`` above the chi-square limit or when frequency dependent."""
     sampling: Sampling | None = None
+    """When and how currents are sampled, by the best model; None where the flux run did not show the instant."""
     samplings: tuple[tuple[float, Sampling], ...] = ()
+    """The same by every model that counts, with its weight. Tuple of (float, Sampling)."""
     apart_s: float = 0.0
+    """How far the instants of square waves and turning machine lie apart where they contradict, else 0 (s)."""
 
     def d_change(self, i_d_a: float) -> float:
         """Return the relative change of L_d from no current to i_d, by its slope at the bias."""

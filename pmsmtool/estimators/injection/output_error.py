@@ -39,27 +39,19 @@ LEAST_SPREAD = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class AxisModel:
-    """Physical parameters of the response.
-
-    Attributes
-    ----------
-    L_h, R_ohm : float
-        Incremental inductance (H) and resistance of the axis at the injection, inverter slope included (ohm).
-    delay : float
-        Delay D from sample to acting voltage (T_s), 0 <= D.
-    lag_s : float
-        Time constant of the current sensor (s), 0 for none.
-    eddy_s, eddy_tau_s : float
-        Eddy currents add ``eddy_s``/(L tau) of the flux that a first order of time constant tau lags behind; iron loss
-        is a tau far below the period (s).
-    """
+    """Physical parameters of the response."""
 
     L_h: float
     R_ohm: float
+    """Incremental inductance (H) and resistance of the axis at the injection, inverter slope included (ohm)."""
     delay: float
+    """Delay D from sample to acting voltage (T_s), 0 <= D."""
     lag_s: float
+    """Time constant of the current sensor (s), 0 for none."""
     eddy_s: float = 0.0
     eddy_tau_s: float = 1.0
+    """Eddy currents add ``eddy_s``/(L tau) of the flux that a first order of time constant tau lags behind; iron loss
+    is a tau far below the period (s)."""
 
     @property
     def flux_inductance_h(self) -> float:
@@ -90,21 +82,14 @@ class AxisModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pulses:
-    """The commands as the bridge applies them.
-
-    Attributes
-    ----------
-    share : ndarray, shape (n,)
-        Part of the period during which the command's two pulses stand (1).
-    height_v : ndarray, shape (n,)
-        Their voltage (V).
-    rest_v : float
-        Constant voltage beside them (V): minus the mean of the commands.
-    """
+    """The commands as the bridge applies them."""
 
     share: Array
+    """Part of the period during which the command's two pulses stand (1). Shape (n,)."""
     height_v: Array
+    """Their voltage (V). Shape (n,)."""
     rest_v: float
+    """Constant voltage beside them (V): minus the mean of the commands."""
 
 
 def recursion(pole: float, drive: Array, start: float) -> Array:

@@ -45,18 +45,12 @@ LAGS = (0.0, 0.02, 0.05, 0.08, 0.12, 0.17, 0.23, 0.3, 0.4, 0.55, 0.75, 1.0, 1.5)
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """When and how the currents are sampled.
-
-    Attributes
-    ----------
-    instant_s : float
-        How late after the period's start, at which the angle is read (s).
-    lag_s : float
-        Time constant of the current sensor (s).
-    """
+    """When and how the currents are sampled."""
 
     instant_s: float = 0.0
+    """How late after the period's start, at which the angle is read (s)."""
     lag_s: float = 0.0
+    """Time constant of the current sensor (s)."""
 
 
 def sampled_ripple(
@@ -142,26 +136,18 @@ def course_s2(sampling: Sampling, period_s: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownInstant:
-    """The part of u_d in proportion to -psi w^2, and what instant and lag would make of it.
-
-    Attributes
-    ----------
-    value_s, std_s : float
-        Measured, and its standard deviation (s).
-    period_s, dead_time_s : float
-        Control period, and the dead time that shifts the pulses by half of it (s).
-    computation_periods : float
-        From the period's start to the voltage that was computed there (T_s).
-    predicted_s : ndarray, shape (len(INSTANTS), len(LAGS))
-        Prediction (s).
-    """
+    """The part of u_d in proportion to -psi w^2, and what instant and lag would make of it."""
 
     value_s: float
     std_s: float
+    """Measured, and its standard deviation (s)."""
     period_s: float
     dead_time_s: float
+    """Control period, and the dead time that shifts the pulses by half of it (s)."""
     computation_periods: float
+    """From the period's start to the voltage that was computed there (T_s)."""
     predicted_s: NDArray[np.float64]
+    """Prediction (s). Shape (len(INSTANTS), len(LAGS))."""
 
     def sampling(self, delay: float, lag_s: float) -> Sampling:
         """Return the instant that a delay from sample to acting voltage (T_s) stands for."""
@@ -200,27 +186,19 @@ def _place(grid: tuple[float, ...], value: float) -> tuple[int, float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoastingPairs:
-    """Rows of a speed run as this module needs them.
-
-    Attributes
-    ----------
-    w : ndarray, shape (n,)
-        Electrical speed of every row (rad/s).
-    u_d : ndarray, shape (n,)
-        d voltage of the flux linkages, if the currents were sampled at the period's start (V).
-    i_d, i_q, v_d, v_q : ndarray, shape (n,)
-        Mean of the samples, and command (A, V).
-    pairs : sequence of (int, int)
-        Rows with d currents of both signs.
-    """
+    """Rows of a speed run as this module needs them."""
 
     w: Array
+    """Electrical speed of every row (rad/s). Shape (n,)."""
     u_d: Array
+    """d voltage of the flux linkages, if the currents were sampled at the period's start (V). Shape (n,)."""
     i_d: Array
     i_q: Array
     v_d: Array
     v_q: Array
+    """Mean of the samples, and command (A, V). Shape (n,)."""
     pairs: Sequence[tuple[int, int]]
+    """Rows with d currents of both signs."""
 
 
 def shown_instant(

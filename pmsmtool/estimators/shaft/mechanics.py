@@ -94,35 +94,24 @@ METHOD = "torque pulses and coasting, output error on position, whitened"
 
 @dataclass(frozen=True, slots=True)
 class MechanicsResult:
-    """What a run of current steps says of the shaft.
-
-    Attributes
-    ----------
-    J, B, tau_c : Estimate
-        Inertia (kg m2), viscous (N m s) and Coulomb friction (N m).
-    fit_std : tuple of float
-        Standard deviations of the three by the fit alone, without the torque's scale that they share.
-    ripple : float
-        Deviation of a block's torque that the residual asked for, of the push's.
-    unexplained : bool
-        Whether that is so much more than the currents' noise and the floor that it widens the intervals notably.
-    harmonics : AngleHarmonics
-        Cogging torque and encoder error that were taken out.
-    drag : Estimate or None
-        Torque per square of the speed (N m s2), where the data ask for it: it is in neither B nor tau_c.
-    chi2 : float
-        Reduced chi-square of the whitened position.
-    """
+    """What a run of current steps says of the shaft."""
 
     J: Estimate
     B: Estimate
     tau_c: Estimate
+    """Inertia (kg m2), viscous (N m s) and Coulomb friction (N m)."""
     fit_std: tuple[float, float, float]
+    """Standard deviations of the three by the fit alone, without the torque's scale that they share."""
     ripple: float
+    """Deviation of a block's torque that the residual asked for, of the push's."""
     chi2: float
+    """Reduced chi-square of the whitened position."""
     unexplained: bool
+    """Whether that is so much more than the currents' noise and the floor that it widens the intervals notably."""
     harmonics: AngleHarmonics = NO_HARMONICS
+    """Cogging torque and encoder error that were taken out."""
     drag: Estimate | None = None
+    """Torque per square of the speed (N m s2), where the data ask for it: it is in neither B nor tau_c."""
 
     @property
     def note(self) -> str:
