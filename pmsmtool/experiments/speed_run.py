@@ -185,7 +185,7 @@ def coast_through(drive: Drive, plan: SpeedPlan, pole_pairs: int) -> Rows:
             drive.wait(settle_s)
             settle_s = plan.settle_s
             rows.append(_window(drive, _half_window(drive, plan, speed, pole_pairs, i_q != 0.0)))
-            if held and i_d and k % 2:
+            if (held or lead) and i_d and k % 2:
                 first, second = ((r["omega_second_rad_s"] - r["omega_first_rad_s"]) / r["half_s"] for r in rows[-2:])
                 lead += (first - second) / (2.0 * i_d * plan.per_ampere_rad_s2 * pole_pairs)
                 lead = min(max(lead, -LEAD_MOST), LEAD_MOST)
