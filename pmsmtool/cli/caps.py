@@ -57,8 +57,8 @@ def caps_command(bus: BusOptions, out: Output, machine: Path | None, map_file: P
         bus = rehearsal_bus(bus, eds=eds, machine=machine)
         assumed = assumptions_of(eds, None if machine is None else load_machine_file(machine))
     with open_node(bus, within_s=LOOKING_S) as node:
-        found = examine(node, given, may_try=eds is not None)
-    refused = refused_of_design(machine, eds, found, out)
+        found = as_in_file(examine(node, given, may_try=eds is not None), eds)
+    refused = refused_of_design(machine, found, out)
     facts = {**_facts(found), **({"refused": refused} if machine is not None else {})}
     out.result("caps", facts, lambda: _lines(found, out.verbosity > 0, asked=eds is None))
     for name, why in found.drive_map.not_written(BY_NAME).items():
@@ -80,25 +80,37 @@ def caps_command(bus: BusOptions, out: Output, machine: Path | None, map_file: P
         out.warn(firmware)
 
 
+def as_in_file(found: Capabilities, eds: str | None) -> Capabilities:
+    """Return what a drive gives, its map as far as the drive's file agrees, with the limits that this states."""
+    if eds is None:
+        return found
+    from pmsmtool.drive_maps import sheet_check
+    from pmsmtool.sim.foreign.file_rows import read_makers_objects
+
+    rows = read_makers_objects(eds).rows
+    types = {at: row.data_type.name for at, row in rows.items()}
+    limits = {at: row.bounds for at, row in rows.items()}
+    written = {at for at, row in rows.items() if "w" in row.access}
+    return dataclasses.replace(found, drive_map=sheet_check.as_in_file(found.drive_map, types, limits, written))
+
+
 def refused_of_design(
-    machine: Path | None, eds: str | None, found: Capabilities, out: Output, request: TuneRequest | None = None
+    machine: Path | None, found: Capabilities, out: Output, request: TuneRequest | None = None
 ) -> dict[str, str]:
-    """Say which values of a machine's design (the usual one) the drive of a file refuses, and why; return them."""
-    if machine is None or eds is None or not found.map_is_drives:
+    """Say which values of a machine's design (the usual one) a drive refuses, or slows, and why; return the refused."""
+    if machine is None or not found.map_is_drives or found.drive_map.staging:
         return {}
     from pmsmtool.commissioning.axis_design import refused_by_limits
     from pmsmtool.errors import PmsmtoolError
     from pmsmtool.machine.machine_file import load_machine_file
-    from pmsmtool.sim.foreign.file_rows import read_makers_objects
 
-    limits = {at: row.bounds for at, row in read_makers_objects(eds).rows.items()}
     try:
-        refused = refused_by_limits(load_machine_file(machine), found.drive_map, limits, request)
+        refused, slower = refused_by_limits(load_machine_file(machine), found.drive_map, request)
     except PmsmtoolError as error:
         out.warn(f"whether this drive holds a design of {machine} is not known: {error.what}")
         return {}
-    for name, why in refused.items():
-        out.warn(f"of the design of {machine} this drive refuses {name}: {why}")
+    for line in (*slower, *(f"this drive refuses {name}: {why}" for name, why in refused.items())):
+        out.warn(f"of the design of {machine} {line}")
     return refused
 
 

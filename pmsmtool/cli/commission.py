@@ -125,7 +125,7 @@ def commission_command(
     from pmsmtool.cli.consent import refuse_unattended
     from pmsmtool.commissioning.commission import Commissioning
     from pmsmtool.commissioning.compared_stage import check_accepted
-    from pmsmtool.errors import ConfigError
+    from pmsmtool.errors import ConfigError, NotAvailable
     from pmsmtool.flash.journal import JournalFolder
     from pmsmtool.flash.map_gate import forget_map
     from pmsmtool.machine.machine_file import load_machine_file
@@ -158,7 +158,7 @@ def commission_command(
     elif bus.simulated():
         _erase_memory(bus, out)
     given = None if map_file is None else read_map(map_file)
-    with _opened(bus, given) as (drive, found):
+    with _opened(bus, given, eds) as (drive, found):
         if drive_bandwidth_hz is not None and found.drive_map.staging:
             raise ConfigError(
                 f"--drive-bandwidth-hz: for a drive that cannot be reflashed, and {found.drive_map.name!r} is none",
@@ -175,14 +175,21 @@ def commission_command(
         chain.require, chain.accept_limits = require, accept_limits
         for line in chain.stages.plan_lines():
             out.note(line)
-        refused_of_design(machine, eds, found, out, asked["tune"])
+        refused = refused_of_design(machine, found, out, asked["tune"])
+        if refused and (eds or rehearse) is not None:
+            raise NotAvailable(
+                f"a drive with these objects does not hold the design of {machine}: {', '.join(refused)}",
+                likely="a drive for other motors, or a value of MACHINE in a wrong unit",
+                hint="take another drive, correct MACHINE, or ask for less (--bandwidth-hz); nothing was moved",
+            )
         with _reported(run, out, fresh=begun is None):
             chain.carry_out()
 
 
 @contextmanager
-def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDrive, Capabilities]]:
+def _opened(bus: BusOptions, given: DriveMap | None, eds: str | None) -> Iterator[tuple[CanopenDrive, Capabilities]]:
     """Open the drive with what it has; without a map, the one of its identity is used."""
+    from pmsmtool.cli.caps import as_in_file
     from pmsmtool.cli.drive_access import claimed_node
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.measurement.capabilities import examine
@@ -191,7 +198,8 @@ def _opened(bus: BusOptions, given: DriveMap | None) -> Iterator[tuple[CanopenDr
     with bus.connect() as connection:
         node = DriveNode(connection, claimed_node(connection, bus.node))
         node.refuse_late()
-        found = examine(node, given, may_try=bus.simulated() and "&eds=" in (bus.channel or ""))
+        may_try = bus.simulated() and "&eds=" in (bus.channel or "")
+        found = as_in_file(examine(node, given, may_try=may_try), eds)
         node.close()
         drive = open_for_level(connection, node.node, found)
         yield drive, found

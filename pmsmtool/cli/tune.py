@@ -126,8 +126,8 @@ def tune_command(
 
     With --map of a drive with fixed firmware: the limits of torque or current, slope and speed are designed, so that
     its voltage demand stays within the limit. Guarantee and cost are printed. The map must have objects for slope and
-    limit; cia402 and copley have them. Loops are checked with the rounded gains of the drive, or with gains of the
-    bandwidth in --drive-bandwidth-hz.
+    limit; cia402 and copley have them. Without them, as for epos4, its gains alone are designed. Loops are checked with
+    the rounded gains of the drive, or with gains of the bandwidth in --drive-bandwidth-hz.
 
     With --axis: gains, feed-forward and notch of the speed and position loops in the structure of the drive, with the
     least phase margin and the largest |S| over the tolerance box (inertia, torque, resonance), and a jerk-limited move.
@@ -267,13 +267,11 @@ def _design(source: MachineFile, drive_map: DriveMap, asked: dict[str, Any]) -> 
     if drive_map.staging:
         _refuse_for_reflashed(drive_map.name, {"drive_bandwidth_hz": bandwidth_hz, **limits})
         return tune(source, TuneRequest(**asked))
-    from pmsmtool.commissioning.axis_design import held_design
-    from pmsmtool.design.closed_drive import ClosedDrive, tune_closed
+    from pmsmtool.commissioning.design_stages import closed_design
 
     options = {name.removeprefix("limit_"): f"--{name.replace('_', '-')}" for name in _LIMITS}
     with options_named(options | {"bandwidth_hz": "--drive-bandwidth-hz"}):
-        drive = ClosedDrive(drive_map.name, frozenset(drive_map.cells), bandwidth_hz, **limits)
-    return held_design(tune_closed(source, TuneRequest(**asked), drive)[0], drive_map)
+        return closed_design(source, TuneRequest(**asked), drive_map, bandwidth_hz=bandwidth_hz, **limits)
 
 
 _LIMITS = ("limit_speed_rpm", "limit_rise_s", "limit_acceleration_rpm_per_s")

@@ -6,6 +6,7 @@ A loop whose gains the drive has no object for is not judged: its margins would 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -52,8 +53,37 @@ Designed = Callable[[MachineFile, TuneRequest], Design]
 
 
 def held_by(drive_map: DriveMap, designed: Designed) -> Designed:
-    """Return a rule that designs for a drive: what :func:`held_design` makes of another rule's design."""
-    return lambda source, request: held_design(designed(source, request), drive_map)
+    """Return a rule that designs for a drive: what :func:`held_design` makes of another rule's design.
+
+    Current loops whose gains are beyond what the drive's objects hold are designed slower.
+    """
+    fitting = _fitting(drive_map, designed)
+    return lambda source, request: held_design(fitting(source, request), drive_map)
+
+
+SLOWED = "slower by what the objects of"
+LEAST_SHARE = 0.1
+"""Slowest current loop, of the one designed, that is taken for the limits of its objects: below, the drive does not fit
+the motor."""
+
+
+def _fitting(drive_map: DriveMap, designed: Designed) -> Designed:
+    """Return a rule whose current loops are so slow that the drive's objects hold their gains."""
+
+    def rule(source: MachineFile, request: TuneRequest) -> Design:
+        design = designed(source, request)
+        wanted = replace(design, values={**design.values, **one_pair(design, drive_map.cells)}).parameter_set()
+        held = _slowed(drive_map, dict.fromkeys(CURRENT_GAINS, 1), wanted)
+        slower = [name for name, value in held.items() if value < wanted.values[name]]
+        share = min((held[name] / wanted.values[name] for name in slower), default=1.0)
+        if drive_map.staging or not LEAST_SHARE < share < 1.0:
+            return design
+        hertz = share * float(design.facts["current_bandwidth_rad_s"]) / math.tau
+        made = designed(source, replace(request, method="imc", bandwidth_hz=hertz))
+        note = f"current loops of {hertz:.4g} Hz, {SLOWED} {', '.join(slower)} hold"
+        return replace(made, notes=(*made.notes, note))
+
+    return rule
 
 
 def held_design(design: Design, drive_map: DriveMap) -> Design:
@@ -87,18 +117,19 @@ def held_design(design: Design, drive_map: DriveMap) -> Design:
 
 
 def refused_by_limits(
-    source: MachineFile,
-    drive_map: DriveMap,
-    limits: Mapping[tuple[int, int], tuple[float, float]],
-    request: TuneRequest | None = None,
-) -> dict[str, str]:
-    """Return which values of a machine's design (the usual one) a drive with such limits refuses, and why.
+    source: MachineFile, drive_map: DriveMap, request: TuneRequest | None = None
+) -> tuple[dict[str, str], list[str]]:
+    """Return which values of a machine's design (the usual one) the objects of a drive do not hold, and why.
+
+    With them, what is slower for these objects, one line or none.
 
     Raises ConfigError, DesignInfeasible: the machine has no such design.
     """
     asked = replace(request or TuneRequest(), governor="off", field_weakening="off", predictor=False)  # no such objects
-    made = held_design(tune(source, asked), drive_map).parameter_set()
-    return drive_map.limited(limits).refused(without_assumed(drive_map, made)[0])
+    made = _fitting(drive_map, tune)(source, asked)
+    wanted = replace(made, values={**made.values, **one_pair(made, drive_map.cells)}).parameter_set()
+    refused = drive_map.refused(without_assumed(drive_map, wanted)[0])
+    return refused, [note for note in made.notes if SLOWED in note]
 
 
 _LOOPS = {CURRENT_LOOPS: "current loops", SPEED_LOOP: "speed loop"}
@@ -296,7 +327,8 @@ def _slowed(drive_map: DriveMap, group: dict[str, int], wanted: ParameterSet) ->
     for cell, power in rows:
         counts = cell.counts(wanted.values[cell.name], wanted.values)
         grows = power - group.get(cell.gain, 0)
-        share = min(share, (cell.largest / counts) ** (1.0 / grows) if counts and cell.form != "time" else 1.0)
+        if counts and grows and cell.form != "time":
+            share = min(share, (cell.largest / counts) ** (1.0 / grows))
     slowed = {cell.name: wanted.values[cell.name] * share**power for cell, power in rows}
     for cell, _ in rows:
         if cell.form == "time":

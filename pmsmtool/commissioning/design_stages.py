@@ -316,6 +316,33 @@ def closed_stage(run: RunDirectory, request: TuneRequest, drive_map: DriveMap, b
     return replace(stage, fallbacks=(*stage.fallbacks, f"{LIMITS}: not available: {reason}"))
 
 
+def closed_design(
+    source: MachineFile, request: TuneRequest, drive_map: DriveMap, *, rise_s: float, bandwidth_hz: float | None,
+    speed_rpm: float | None, acceleration_rpm_per_s: float | None,
+) -> Design:  # fmt: skip
+    """Return the design of a closed drive: its gains and its limits; of one without objects for limits the gains.
+
+    Raises ConfigError, DesignInfeasible: as :func:`~pmsmtool.design.closed_drive.tune_closed`; NotAvailable: the drive
+    has objects for neither, or none for limits of which something is stated.
+
+    Parameters
+    ----------
+    rise_s, bandwidth_hz, speed_rpm, acceleration_rpm_per_s : float
+        As of a :class:`~pmsmtool.design.closed_drive.ClosedDrive`; None: not stated.
+    """
+    stated = bandwidth_hz, speed_rpm, acceleration_rpm_per_s
+    try:
+        drive = ClosedDrive(
+            drive_map.name, frozenset(drive_map.cells), bandwidth_hz, rise_s, speed_rpm, acceleration_rpm_per_s
+        )
+    except NotAvailable as lacking:
+        if any(value is not None for value in stated) or not drive_map.cells.keys() >= set(GAINS):
+            raise
+        design = held_by(drive_map, tune)(source, request)
+        return replace(design, notes=(*design.notes, f"{LIMITS}: not available: {lacking.what}"))
+    return held_by(drive_map, partial(_limited, drive))(source, request)
+
+
 def guaranteed(design: Design) -> bool:
     """Whether a design holds limits of a closed drive with their guarantee."""
     return f"{FACT}demand_v" in design.facts

@@ -107,8 +107,8 @@ class ClosedDrive:
                 f"the drive map {self.name!r} has no object for {', '.join(missing)}",
                 where="drive with fixed firmware",
                 likely="its maker documents no torque mode with a slope and a limit (0x6087, 0x6072, 0x6076)",
-                hint="design without --map: `flash-params --map` and `commission` write what the drive takes; a master "
-                "that limits the slope of 0x6071 itself has the effect of these limits",
+                hint="add --axis for gains of its speed and position loops, or design without --map: `flash-params "
+                "--map` and `commission` write what the drive takes",
             )
 
 

@@ -279,19 +279,22 @@ def _start(node: DriveNode) -> None:
 
 def set_quick_stop(node: DriveNode, option: int) -> int | None:
     """Set what a quick stop does (0x605A) where the drive takes it; return what is in force, None where it has none."""
-    with contextlib.suppress(SdoAbort):
-        if node.whole(objects.QUICK_STOP_OPTION) != option:
-            node.put(objects.QUICK_STOP_OPTION, option)
+    _put_option(node, objects.QUICK_STOP_OPTION, option)
     with contextlib.suppress(SdoAbort):
         return node.whole(objects.QUICK_STOP_OPTION)
     return None
 
 
+def _put_option(node: DriveNode, item: objects.DriveObject, option: int) -> None:
+    """Set an option code where the drive has it and takes it, in the width that it has there."""
+    with contextlib.suppress(SdoAbort):
+        if node.held(item) not in (None, option):
+            node.put(item, option)
+
+
 def _fault_without_ramp(node: DriveNode) -> None:
     """Make a fault remove the voltage (0x605E) where a lost connection is one: at rest a ramp would not be seen."""
-    with contextlib.suppress(SdoAbort):
-        if node.whole(objects.FAULT_REACTION) != FaultReaction.DISABLE:
-            node.put(objects.FAULT_REACTION, FaultReaction.DISABLE)
+    _put_option(node, objects.FAULT_REACTION, FaultReaction.DISABLE)
 
 
 def _abort_option(drive: CanopenDrive) -> AbortConnection | None:
@@ -301,6 +304,7 @@ def _abort_option(drive: CanopenDrive) -> AbortConnection | None:
     """
     node = drive.node
     try:
+        node.held(objects.ABORT_CONNECTION)  # from here on it is read and written in the width that the drive has
         option = node.whole(objects.ABORT_CONNECTION)
         if option != AbortConnection.DISABLE_VOLTAGE:
             with contextlib.suppress(SdoAbort):

@@ -477,6 +477,11 @@ def allowed(node: DriveNode, limits: Iterator[Quantity]) -> tuple[Quantity, floa
     return None
 
 
+def limits_current(node: DriveNode, rated: float) -> bool:
+    """Whether the drive has a limit of the current of its own."""
+    return allowed(node, current_limits(node, rated)) is not None
+
+
 def limits_speed(node: DriveNode) -> bool:
     """Whether the drive has a limit of the speed of its own."""
     return allowed(node, speed_limits(node)) is not None
@@ -511,12 +516,12 @@ def watched_by_tool(node: DriveNode, rated: float) -> list[str]:
     Units of a turn that the map states otherwise than the drive's objects are told with them.
     """
     lines = [*unlike_stated(node), *low_limits(node, rated)]
-    if allowed(node, current_limits(node, rated)) is None:
+    if not limits_current(node, rated):
         lines.append(
             "current   no limit in the drive (0x6073, 0x6072, or the maker's own): no command asks for more, and this"
             " program looks"
         )
-    if allowed(node, speed_limits(node)) is None:
+    if not limits_speed(node):
         lines.append(
             "speed     no limit in the drive (0x6080): this program looks every 50 ms and removes the voltage at the "
             "limit itself"

@@ -75,7 +75,6 @@ class MappedRecorderDrive(RecorderDrive, TorqueDrive):
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
         super().__init__(connection, node_id, drive_map=drive_map)
-        self.commands_bounded_current = False  # a speed step is the drive's own
         traces = recorder_of(self.node, POLL_PERIOD_S)
         if not isinstance(traces, CommandedRecorder):
             raise NotAvailable("pmsmtool reads no recorder of this drive", where=f"node {self.node.node}")

@@ -213,7 +213,8 @@ def _stop_once(node: DriveNode, say: Callable[[str], None], *, ramp: bool) -> St
 def _option(node: DriveNode) -> QuickStop | None:
     """Return the quick stop option; None where the drive has none, or one of its maker's own."""
     with contextlib.suppress(SdoAbort, ValueError):
-        return QuickStop(node.whole(objects.QUICK_STOP_OPTION))
+        held = node.held(objects.QUICK_STOP_OPTION)
+        return None if held is None else QuickStop(int(held))
     return None
 
 

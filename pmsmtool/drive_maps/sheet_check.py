@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 
 from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap, SignalCell
@@ -64,19 +64,35 @@ def _told(sheet: Eds, sub: int) -> Iterator[int]:
 
 
 def map_of_sheet(sheet: Eds) -> DriveMap:
-    """Return the map of a data sheet's drive: its family's (CiA 402 where none is shipped) as far as the file agrees.
+    """Return the map of a data sheet's drive: its family's, or that of CiA 402, as far as the file agrees."""
+    written = {at for at, entry in sheet.objects.items() if "w" in entry.access}
+    return as_in_file(family_of_sheet(sheet) or load_family(GENERIC), types_of(sheet), limits_of(sheet), written)
 
-    Rows that the file contradicts, or lets only be read, are left out with the reason; the others have its limits.
+
+def as_in_file(
+    drive_map: DriveMap,
+    types: Mapping[tuple[int, int], str],
+    limits: Mapping[tuple[int, int], tuple[float, float]],
+    written: Collection[tuple[int, int]],
+) -> DriveMap:
+    """Return a map as far as a file agrees: its rows have the file's limits.
+
+    Rows that the file contradicts, or lets only be read, are left out with the reason.
+
+    Parameters
+    ----------
+    types, limits : mapping by (index, sub)
+        Data types of the file's objects; smallest and largest number.
+    written : collection of (index, sub)
+        Objects that can be written.
     """
-    drive_map, types = family_of_sheet(sheet) or load_family(GENERIC), types_of(sheet)
     gone = {}
     for name, cell in drive_map.cells.items():
-        entry = sheet.objects.get((cell.index, cell.sub))
         if wrong := contradictions(drive_map, types, [name]):
             gone[name] = wrong[0].removeprefix(f"{drive_map.name} {name} ")
-        elif entry is not None and "w" not in entry.access and name not in OWN_SCALES:
+        elif (cell.index, cell.sub) not in written and name not in OWN_SCALES:
             gone[name] = f"0x{cell.index:04X}:{cell.sub:02X}: the file lets it only be read"
-    found = drive_map.limited(limits_of(sheet))
+    found = drive_map.limited(limits)
     return found.without(gone) if gone else found
 
 

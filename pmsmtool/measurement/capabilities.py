@@ -22,6 +22,8 @@ from pmsmtool.drive.motion_objects import (
     NO_RATED,
     first_of_axes,
     limited_speed,
+    limits_current,
+    limits_speed,
     position_turns,
     position_units,
     rated_apk,
@@ -65,7 +67,7 @@ FEATURES: Mapping[str, str] = {
     "heartbeat": "consumer heartbeat (0x1016)",
     "abort option": "abort connection option (0x6007)",
     "quick stop": "quick stop option (0x605A)",
-    "limits": "its own current and speed limit (0x6073, 0x6075, 0x6080)",
+    "limits": "its own current and speed limit (0x6073, 0x6075, 0x6080; or in a map: the maker's objects)",
     "supervision": "consumer heartbeat (0x1016), or node guarding (0x100C, 0x100D), or an expected PDO (0x1400:05)",
     "rated current": NO_RATED,
     "set-points": "current set-points for d and q",
@@ -92,8 +94,8 @@ FEATURES: Mapping[str, str] = {
 """What methods need, as a person reads it."""
 
 _SAFE = ("heartbeat", "abort option", "quick stop", "limits")
-_INJECT = (*_SAFE, "set-points", "excitation", "recorder")
-_RECORD = (*_SAFE, "recorder", "torque mode")
+"""What the reference drive must have for any motion."""
+_INJECT = ("set-points", "excitation", "recorder")
 _BOUNDED = ("supervision", "rated current")
 """What is safe where every command is a current that this program bounds: it replaces limits that the drive lacks."""
 _ON_PLATE = {"rated current": "rated_current", "position": "counts_per_turn"}
@@ -104,11 +106,12 @@ _ANGLE = (*_TURNING, "encoder")
 _SEEN = ("position", "range")
 """What shows the speed."""
 _STANDARD = (*_BOUNDED, *_SEEN, "commutation angle")
+_RECORD = (*_BOUNDED, *_SEEN, "current", "torque mode", "recorder")
 _PUSH = (*_BOUNDED, "push", *_SEEN, "current")
 _MOVES = (*_BOUNDED, *_SEEN, "current", "profile position")
 """What a move by the drive's own position loop needs: its current is watched."""
-_WATCHED = (*_SAFE, *_SEEN, "current")
-"""What the guard needs while the drive runs by itself."""
+_WATCHED = ("supervision", "abort option", "limits", *_SEEN, "current")
+"""What the guard needs while the drive runs by itself: it bounds no current then, so the drive's own limits must."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +244,7 @@ class Capabilities:
     @property
     def unsafe(self) -> bool:
         """Whether the full level lacks only what makes motion safe: such a drive is refused, it is no lower level."""
-        missing = set(dict(_LEVELS)[CapabilityLevel.FULL]) - self.features
+        missing = {*dict(_LEVELS)[CapabilityLevel.FULL], *self._always} - self.features
         return bool(missing) and missing <= set(_SAFE)
 
     def rows(self) -> tuple[Row, ...]:
@@ -377,7 +380,6 @@ def examine(node: DriveNode, given: DriveMap | None = None, *, may_try: bool = F
         "heartbeat": node.has(0x1016, 1) if drive_map.staging else node.takes(CONSUMER),
         "abort option": node.has(0x6007, 0),
         "quick stop": node.has(0x605A, 0),
-        "limits": all(node.has(index, 0) for index in (0x6073, 0x6075, 0x6080)),
         "line voltage": _shows_link(node, drive_map) or {"u_d_v", "u_q_v"} <= set(drive_map.signals),
         "commutation angle": drive_map.capabilities.commutation_angle
         and bool(modes & _bit(Mode.CYCLIC_TORQUE_ANGLE))
@@ -386,12 +388,14 @@ def examine(node: DriveNode, given: DriveMap | None = None, *, may_try: bool = F
     rated = None if drive_map.staging else _told(lambda: rated_apk(node))
     if not drive_map.staging:
         has |= _motion(node, rated) | {"encoder": True, "frame": True}
+        has["limits"] = rated is not None and limits_current(node, rated) and limits_speed(node)
         guarding = node.takes(GUARD_TIME_MS) and node.takes(LIFE_TIME_FACTOR)
         has["supervision"] = has["heartbeat"] or guarding or expects_pdos(node)
     else:  # only then these objects are what the reference drive has there
         there = node.has(HALL_COMMUTATION.index, HALL_COMMUTATION.sub)
         halls = node.whole(HALL_COMMUTATION) if there else 0
         torque = bool(modes & (_bit(Mode.PROFILE_TORQUE) | _bit(Mode.CYCLIC_TORQUE))) and node.has(0x6071, 0)
+        has["limits"] = all(node.has(index, 0) for index in (0x6073, 0x6075, 0x6080))
         has |= {
             "position": node.has(0x6064, 0) and node.has(0x608F, 1),
             "range": True,
@@ -568,7 +572,7 @@ WAYS: Mapping[str, Mapping[Method, Way]] = {
             from_records=_expected(_INJECT_RUN, 200, ("J_kgm2", 1.5, "%")),
         ),
         Method.RECORDER: Way(
-            (*_RECORD, *_SEEN, "encoder"),
+            (*_RECORD, "encoder"),
             _expected(_RECORDER_RUN, 200, ("J_per_psi", 1.5, "%"), ("tau_c_per_psi", 21.0, "%")),
             "J/psi and tau_c/psi",
         ),

@@ -187,16 +187,20 @@ def test_a_makers_file_is_a_map_with_its_limits(home: Path, capsys: pytest.Captu
 def test_what_of_a_design_is_refused_is_named_before_a_bus_is_opened(
     home: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    limits = {(0x30A0, 1): (0, 100_000_000), (0x30A0, 2): (0, 10_000_000)}
-    for given, refused in (({}, set()), (limits, {"current.K_p_q_v_per_a", "current.K_i_q_v_per_as"})):
+    """Gains that their objects do not hold make a slower current loop; less than a tenth of it, and nothing moves."""
+    slower = {(0x30A0, 1): (0, 100_000_000), (0x30A0, 2): (0, 10_000_000)}
+    limits = {(0x30A0, 1): (0, 10_000_000), (0x30A0, 2): (0, 1_000_000)}
+    both = {"current.K_p_q_v_per_a", "current.K_i_q_v_per_as"}
+    for given, refused, hertz in (({}, set(), ""), (slower, set(), "442.1 Hz"), (limits, both, "")):
         path = write_eds(home / "theirs.eds", epos4(), given)
         assert run(["caps", "interior-2k2", "--eds", str(path), "--json"]) == 0
         told = capsys.readouterr()
         assert set(json.loads(told.out)["refused"]) == refused
         assert told.err.count("of the design of interior-2k2 this drive refuses") == len(refused)
+        assert f"current loops of {hertz}, slower by" in told.err if hertz else "slower by" not in told.err
     asked = ["commission", "interior-2k2", "--eds", str(path), "--speed-max", "400rpm"]  # nobody to consent
-    assert run(asked) == 7 and capsys.readouterr().err.count("this drive refuses current.K_") == 2
-    assert run([*asked, "--bandwidth-hz", "300"]) == 7 and "this drive refuses" not in capsys.readouterr().err
+    assert run(asked) == 9 and capsys.readouterr().err.count("this drive refuses current.K_") == 2
+    assert run([*asked, "--bandwidth-hz", "30"]) == 7 and "this drive refuses" not in capsys.readouterr().err
     infeasible = Mock(side_effect=DesignInfeasible("no gains have these margins"))
     monkeypatch.setattr(axis_design, "refused_by_limits", infeasible)
     assert run(["caps", "interior-2k2", "--eds", str(path)]) == 0

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.commissioning.axis_design import held_design, why_not_judged
+from pmsmtool.commissioning.axis_design import held_by, held_design, why_not_judged
 from pmsmtool.design.closed_drive import RATED, SLOPE, STATED, TORQUE
 from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design, parse_design
 from pmsmtool.design.loops.designed_loops import CURRENT_GAINS, open_loops
@@ -21,6 +21,7 @@ from pmsmtool.design.loops.margins import margin_report
 from pmsmtool.design.loops.sampled_loop import margins
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune
+from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.machine.machine_file import load_machine_file, machine_path
@@ -86,6 +87,21 @@ def test_gains_that_do_not_fit_are_refused() -> None:
     )
     with pytest.raises(ConfigError, match="cannot hold 1 value"):
         held_design(large, load_family("epos4"))
+
+
+@pytest.mark.chain
+def test_loops_whose_gains_the_objects_do_not_hold_are_designed_slower() -> None:
+    """With the margins of the gains that are written; a tenth of the bandwidth and less is no design for the drive."""
+    machine, name = load_machine_file(machine_path("interior-2k2")), "current.K_p_q_v_per_a"
+    whole = held_design(designed(), load_family("epos4"))
+    held = held_by(load_family("epos4").limited({(0x30A0, 1): (0, 50_000_000)}), tune)(machine, TuneRequest())
+    assert held[name] == 50.0 < whole[name]
+    ratio = whole[name] / whole["current.K_i_q_v_per_as"]
+    assert held[name] / held["current.K_i_q_v_per_as"] == pytest.approx(ratio, rel=1e-6)
+    assert held.loops["current_d"].phase_margin_deg > whole.loops["current_d"].phase_margin_deg + 10.0
+    assert any(f"{name}, current.K_i_q_v_per_as hold" in note for note in held.notes)
+    with pytest.raises(ConfigError, match="cannot hold 1 value"):
+        held_by(load_family("epos4").limited({(0x30A0, 1): (0, 5_000_000)}), tune)(machine, TuneRequest())
 
 
 def run(*arguments: str) -> tuple[int, str, BaseException | None]:

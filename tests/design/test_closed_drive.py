@@ -30,7 +30,7 @@ from pmsmtool.design.closed_drive import (
     current_loops,
     tune_closed,
 )
-from pmsmtool.design.design_file import Design, design_text, parse_design
+from pmsmtool.design.design_file import Design, design_text, load_design, parse_design
 from pmsmtool.design.ratings import ratings
 from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune
@@ -266,6 +266,22 @@ def test_from_the_machine_to_the_objects_of_the_drive(tmp_path: Path, monkeypatc
     assert counts[0] == pytest.approx(math.floor(1000.0 * wanted[SLOPE] / wanted[RATED]))
     assert counts[1] == pytest.approx(math.floor(1000.0 * wanted[TORQUE] / wanted[RATED]))
     assert values[2] == 600
+
+
+@pytest.mark.chain
+def test_a_drive_without_objects_for_limits_has_its_gains_designed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `commission` designs it, in the drive's counts; what is stated of limits, or no gains either, is exit 9."""
+    monkeypatch.chdir(tmp_path)
+    asked = ("tune", "interior-2k2", "-o", "design.toml", "--map")
+    result = CliRunner().invoke(cli, [*asked, "epos4"], catch_exceptions=False)
+    assert result.exit_code == 0 and "limits that keep the drive out of saturation: not available" in result.output
+    gains = load_family("epos4").quantised(load_design(Path("design.toml")).parameter_set()).values
+    assert load_design(Path("design.toml"))["current.K_p_q_v_per_a"] == gains["current.K_p_q_v_per_a"] > 100.0
+    for others in (["epos4", "--limit-speed-rpm", "600"], ["epos2"]):
+        error = CliRunner().invoke(cli, [*asked, *others]).exception
+        assert isinstance(error, NotAvailable) and "--axis" in error.hint and "motor.I_max_apk" in error.what
 
 
 def test_the_shipped_standard_map_offers_the_limits() -> None:

@@ -48,7 +48,7 @@ from pmsmtool.experiments.mechanics_run import acceleration_per_ampere
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import InverterParameters, MachineParameters
 from pmsmtool.sim.bus import PmsmSimBus
-from pmsmtool.sim.node.dictionary import Refused
+from pmsmtool.sim.node.dictionary import Entry, Refused
 from pmsmtool.sim.node.session import Session
 from tests.drive.bench import COMMANDS
 from tests.foreign.data_sheets import COMMON, HEARTBEAT, TORQUE, Row, faulhaber, identity, write_eds
@@ -67,9 +67,16 @@ LEFT = "left operation|heartbeat of the master"
 EXCLUDED = {*COMMANDS, "cia402.statusword"}
 
 
+MA_RMS = 1e-3 * math.sqrt(2.0)
+"""A peak."""
+
+
 @dataclass(frozen=True)
 class DriveClass:
-    """How a drive of one class is opened, and by which objects the tool watches it."""
+    """How a drive of one class is opened, and by which objects the tool watches it.
+
+    ``rated_apk``: of a count of ``rated``; ``shown``: current and A peak of its count, by default permille of rated.
+    """
 
     channel: str
     open: Callable[[Connection], CanopenDrive]
@@ -77,6 +84,8 @@ class DriveClass:
     map_text: str = ""
     rows: tuple[Row, ...] = ()
     rated: tuple[int, int] = (0x6075, 0)
+    rated_apk: float = MA_RMS
+    shown: tuple[int, int, float] | None = None
     limits: tuple[tuple[int, int], ...] = ((0x6073, 0), (0x6080, 0))
 
 
@@ -100,7 +109,7 @@ def _speed_push() -> DriveClass:
         (0x608F, 2, "U32", "ro", "1"),
     )  # fmt: skip
     kind = _sheet((*faulhaber(), *more), lambda bus: SpeedPushDrive(bus, 1, drive_map=load_family("faulhaber")))
-    return replace(kind, rated=(0x2333, 1), limits=((0x2333, 2),))
+    return replace(kind, rated=(0x2333, 1), limits=((0x2333, 2),), shown=(0x6078, 0, MA_RMS))
 
 
 def _inject(connection: Connection) -> CanopenDrive:
@@ -124,8 +133,16 @@ CLASSES = {
     "inject": DriveClass("&level=inject", _inject),
     "recorder": DriveClass("&level=recorder", lambda bus: RecorderDrive(bus, 1)),
     "standard": _family("cia402", StandardDrive),
-    "torque": _family("epos4", TorqueDrive),
-    "mapped-rows": _written(completed(), MappedRecorderDrive),
+    "torque": replace(
+        _family("epos4", TorqueDrive), rated=(0x3001, 1), limits=((0x3001, 2), (0x6080, 0)), shown=(0x30D1, 2, MA_RMS)
+    ),
+    "mapped-rows": replace(
+        _written(completed(), MappedRecorderDrive),
+        rated=(0x2111, 0),
+        rated_apk=0.01,
+        limits=((0x2110, 0),),
+        shown=(0x221C, 0, 0.01),
+    ),
     "mapped-index": _family("ingenia", MappedRecorderDrive),
     "vendor-os-command": _family("synapticon", VendorDrive),
     "position": _sheet(CIA402, lambda bus: PositionDrive(bus, 1, drive_map=load_family("cia402"))),
@@ -159,7 +176,20 @@ class Rig:
 
     @property
     def rated_apk(self) -> float:
-        return 1e-3 * math.sqrt(2.0) * self.session.dictionary.find(*self.kind.rated).number()
+        return self.kind.rated_apk * self.session.dictionary.find(*self.kind.rated).number()
+
+    @property
+    def counts_per_turn(self) -> float:
+        try:
+            counts, turns = (self.session.dictionary.find(0x608F, sub).number() for sub in (1, 2))
+        except Refused:  # the maker's own object holds them
+            return self.session.dictionary["cia402.encoder_counts"].number()
+        return counts / turns
+
+    def held(self, *indices: int) -> list[Entry]:
+        """Those of the objects that the drive has."""
+        found = {entry.row.index: entry for entry in self.session.dictionary if entry.row.sub == 0}
+        return [found[index] for index in indices if index in found]
 
     def memory(self) -> dict[tuple[int, int], bytes]:
         rows = ((entry.row.index, entry.row.sub, entry) for entry in self.session.dictionary)
@@ -172,10 +202,8 @@ class Rig:
     def show_current(self, ampere: float) -> None:
         """Show a current vector of a length (A peak)."""
         if self.kind.standard:
-            share = 1.0 / self.rated_apk if self.kind.rated == (0x6075, 0) else math.sqrt(0.5)  # per mille, or mA
-            self._show(0x6078, 0, lambda: round(-1000.0 * ampere * share))
-            if (own := self.drive.node.map.motion.get("current")) is not None and own.index != 0x6078:
-                self._show(own.index, own.sub, lambda: round(-ampere / own.per_count))
+            index, sub, apk = self.kind.shown or (0x6078, 0, 1e-3 * self.rated_apk)
+            self._show(index, sub, lambda: round(-ampere / apk))
             return
         self._show(0x2070, 1, lambda: -0.6 * ampere)
         self._show(0x2070, 2, lambda: 0.8 * ampere)
@@ -201,8 +229,7 @@ class Rig:
 
     def _show_angle(self, angle: Callable[[], float]) -> None:
         if isinstance(self.drive, StandardDrive):
-            counts, turns = (self.session.dictionary.find(0x608F, sub).number() for sub in (1, 2))
-            per_rad = counts / turns / (2.0 * math.pi)
+            per_rad = self.counts_per_turn / (2.0 * math.pi)
             self._show(0x6064, 0, lambda: (round(angle() * per_rad) + 2**31) % 2**32 - 2**31)
         else:
             self._show(0x2070, 0x14, angle)
@@ -281,10 +308,7 @@ def test_travel(rig: Rig) -> None:
 def test_a_position_that_wraps_is_no_motion(rig: Rig) -> None:
     """The counter of 32 bits goes from its largest number to its smallest; beyond the limit it counts as ever."""
     sign = rig.sign
-    if not rig.kind.standard:
-        edge = sign * 100.0  # rad as a float do not wrap
-    else:
-        edge = sign * 2.0**31 / rig.session.dictionary.find(0x608F, 1).number() * 2.0 * math.pi
+    edge = sign * (2.0**31 / rig.counts_per_turn * 2.0 * math.pi if rig.kind.standard else 100.0)  # a float never wraps
     rig.set_angle(edge - sign * 0.1)
     stopped(
         rig, replace(ENVELOPE, travel_rad=0.5), lambda guard: rig.show_angle(edge + sign * 0.45), "travel",
@@ -540,28 +564,28 @@ def test_the_first_torque_pulse_is_small_and_short() -> None:
 
 def test_until_the_speed_loop_is_proven_a_stop_removes_the_voltage(rig: Rig) -> None:
     """No ramp, which would run a speed loop: 0x605A = 0 and 0x6007 = 2 meanwhile, and no quick stop is active."""
-    options = {key: rig.session.dictionary.find(*key) for key in ((0x605A, 0), (0x6007, 0))}
-    for entry, value in zip(options.values(), (6, 1), strict=True):
+    options = rig.held(0x605A, 0x6007)
+    before = [6, 1][: len(options)]
+    for entry, value in zip(options, before, strict=True):
         entry.value = entry.encode(value)  # as on an EPOS4; a fault when the connection is lost
     seen: list[float] = []
 
     def fail(guard: GuardedDrive) -> None:
-        seen.extend(entry.number() for entry in options.values())
+        seen.extend(entry.number() for entry in options)
         raise ZeroDivisionError("of the experiment")
 
     stopped(rig, ENVELOPE, fail, "of the experiment", STOP_S, error=ZeroDivisionError)
-    assert seen == [QuickStop.DISABLE, AbortConnection.DISABLE_VOLTAGE]
+    assert seen == [QuickStop.DISABLE, AbortConnection.DISABLE_VOLTAGE][: len(options)]
     assert State.QUICK_STOP_ACTIVE not in rig.states
-    assert [entry.number() for entry in options.values()] == [6, 1]
+    assert [entry.number() for entry in options] == before
 
 
 def test_a_drive_that_keeps_its_option_codes_is_stopped_without_a_ramp_too(rig: Rig) -> None:
     def refused(data: bytes) -> None:
         raise Refused(AbortCode.VALUE)
 
-    for key in ((0x605A, 0), (0x6007, 0)):
-        entry = rig.session.dictionary.find(*key)
-        entry.value, entry.sink = entry.encode(2 if key[0] == 0x605A else 3), refused
+    for entry in rig.held(0x605A, 0x6007):
+        entry.value, entry.sink = entry.encode(2 if entry.row.index == 0x605A else 3), refused
 
     def fail(guard: GuardedDrive) -> None:
         rig.states.clear()
@@ -573,10 +597,10 @@ def test_a_drive_that_keeps_its_option_codes_is_stopped_without_a_ramp_too(rig: 
 
 def test_a_supervision_that_leaves_the_voltage_on_is_refused(rig: Rig) -> None:
     """Another state is not enough: quick stop active after which the drive stays energised (0x605A = 6)."""
-    if rig.kind.rows:
-        pytest.skip("the drive behind a data sheet has no quick stop that stays energised")
-    for key, value in (((0x605A, 0), 6), ((0x6007, 0), 3)):
-        entry = rig.session.dictionary.find(*key)
+    options = rig.held(0x605A, 0x6007)
+    if rig.kind.rows or len(options) < 2:
+        pytest.skip("no quick stop that stays energised: the drive of a data sheet, or a lost master is a fault")
+    for entry, value in zip(options, (6, 3), strict=True):
         entry.value, entry.sink = entry.encode(value), lambda data: None
     named = "QUICK STOP ACTIVE, but was still energised, 350 ms"
     with pytest.raises(SafetyRefusal, match=named), guarded(rig.drive, ENVELOPE):

@@ -43,8 +43,7 @@ def shown_limit(rig: Rig, guard: GuardedDrive) -> LimitShown | None:
     guard.enable()
     if not isinstance(rig.drive, TorqueCurrent):
         return show_current_limit(guard, guard.limit_current, 6.0, ENVELOPE.i_max_apk, 0.0)
-    counts, turns = (rig.session.dictionary.find(0x608F, sub).number() for sub in (1, 2))
-    least = 10.0 * turns / counts * 2.0 * math.pi
+    least = 10.0 / rig.counts_per_turn * 2.0 * math.pi
     answer = acceleration_per_ampere(guard, ENVELOPE.i_max_apk, lambda way, seconds: way > least)
     return show_torque_limit(guard, guard.limit_current, answer, ENVELOPE.i_max_apk)
 

@@ -192,7 +192,7 @@ def test_caps_of_an_unknown_drive_says_so() -> None:
         ("&drive=epos4", ("R",), "R by inject: not available: needs current set-points for d and q"),
         ("&drive=bare.toml", (), "encoder, poles by standard: not available: needs"),
         ("&drive=cia402", ("L",), "L by recorder: not available: needs a recorder of currents and voltages"),
-        ("&drive=bare.toml", ("mechanics",), "mechanics by standard: not available: needs torque mode"),
+        ("&drive=bare.toml", ("mechanics",), "mechanics by standard: not available: needs its rated current"),
         ("&level=recorder", ("encoder",), "encoder by inject: not available: needs"),
         ("", ("R", "--method", "vendor"), "R by vendor: not available: needs the maker's identification"),
         ("", ("R", "--method", "manual"), "R by manual: a number you bring"),
@@ -239,7 +239,8 @@ def test_commission_of_a_drive_that_gives_nothing_is_exit_9(monkeypatch: pytest.
     outcome = run("--sim", CHANNEL + "&drive=bare.toml", "--yes", "commission")
     assert isinstance(outcome.exception, NotAvailable) and outcome.exception.exit_code == 9
     text = str(outcome.exception)
-    assert "identify: needs torque mode" in text and "tune: needs pole_pairs, R_s_ohm" in text
+    assert "identify: needs its rated current" in text and "torque mode (0x6502" in text
+    assert "tune: needs pole_pairs, R_s_ohm" in text
 
 
 @pytest.mark.chain

@@ -18,7 +18,7 @@ import can
 import pytest
 
 from pmsmtool.bus.connect import connect
-from pmsmtool.cia402 import State
+from pmsmtool.cia402 import AbortConnection, State
 from pmsmtool.drive.dead_man import CONSUMER_MS, REACTION_S
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import WATCH_S, guarded
@@ -99,6 +99,21 @@ def test_node_guarding_is_proven_where_there_is_no_heartbeat(tmp_path: Path) -> 
             guard.command_current(0.0, 1.0)
             guard.wait(3.0 * WATCH_S)
             assert rig.session.power.state is State.OPERATION_ENABLED
+        assert rig.off_since is not None
+        assert [key for key, data in rig.memory().items() if data != before[key]] == []
+
+
+@pytest.mark.parametrize("kind", ["I32", "U8"])
+def test_option_codes_of_another_width_are_set_and_brought_back(tmp_path: Path, kind: str) -> None:
+    """They were refused as a drive without heartbeat supervision, for a length that was not expected."""
+    codes = {0x6007: "3", 0x605A: "6", 0x605E: "1"}
+    rows = unknown("0x2D", *((index, 0, kind, "rw", value) for index, value in codes.items()))
+    with opened(tmp_path, rows) as rig:
+        before = rig.memory()
+        with guarded(rig.drive, ENVELOPE) as guard:
+            assert guard.proof is not None and guard.proof.abort_connection is AbortConnection.DISABLE_VOLTAGE
+            assert [rig.number(index) for index in (0x6007, 0x605A)] == [2, 0]
+            guard.enable()
         assert rig.off_since is not None
         assert [key for key, data in rig.memory().items() if data != before[key]] == []
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.bus.clock import Schedule, Timer
 from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.sim.foreign.behind import POSITION_MODES, Behind, SetUp, set_up_of
 from pmsmtool.sim.foreign.drawn_gains import DrawnGains
@@ -35,6 +34,7 @@ from pmsmtool.sim.foreign.trace import MARKS as TRACE_MARKS
 from pmsmtool.sim.foreign.trace import RowTrace
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
 from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
+from pmsmtool.sim.node.error_control import NodeGuarding, guarding_of
 from pmsmtool.sim.node.node import VENDOR
 
 if TYPE_CHECKING:
@@ -59,9 +59,6 @@ PID_MARKS = {(0x30A1, 3), (0x60FB, 3)}
 """Gain of the derivative, by which one controller of the position is known."""
 SERIAL = (0x1018, 4)
 ENCODER = (0x608F, 1)
-
-_MS = 1_000_000
-TOGGLE = 0x80
 
 
 class ForeignDrive:
@@ -206,14 +203,7 @@ class ForeignDrive:
 
     def guarding(self, session: Session) -> NodeGuarding | None:
         """Return node guarding where the file has its objects."""
-        if not self.objects.has((0x100C, 0), (0x100D, 0)):
-            return None
-        find = session.dictionary.find
-        heartbeat = find(0x1017, 0) if self.objects.has((0x1017, 0)) else None
-        return NodeGuarding(
-            find(0x100C, 0), find(0x100D, 0), heartbeat, session.schedule, session.answer_guarding,
-            lambda: session.power.connection_lost(0), session.power.connection_regained,
-        )  # fmt: skip
+        return guarding_of(session)
 
 
 def assumptions_of(file: str, machine_file: MachineFile | None = None) -> tuple[str, ...]:
@@ -326,68 +316,3 @@ def _taken(entry: Entry, act: Callable[[float], object]) -> Callable[[bytes], No
             raise
 
     return sink
-
-
-class NodeGuarding:
-    """Answers the master's remote frames, and watches that they come.
-
-    It watches from the first remote frame on, and only while there is a life time (0x100C x 0x100D) and no heartbeat.
-
-    Parameters
-    ----------
-    guard_ms, factor, heartbeat_ms : Entry
-        Objects 0x100C, 0x100D and 0x1017.
-    schedule : Schedule
-        Of the session.
-    answer : callable
-        Sends the NMT state with the toggle bit (0 or ``TOGGLE``).
-    lost, regained : callable
-        Called when no remote frame came within the life time; when one comes again.
-    """
-
-    def __init__(
-        self,
-        guard_ms: Entry,
-        factor: Entry,
-        heartbeat_ms: Entry | None,
-        schedule: Schedule,
-        answer: Callable[[int], None],
-        lost: Callable[[], None],
-        regained: Callable[[], None],
-    ) -> None:
-        self._guard_ms, self._factor, self._heartbeat_ms = guard_ms, factor, heartbeat_ms
-        self._schedule = schedule
-        self._answer, self._lost, self._regained = answer, lost, regained
-        self._toggle = 0
-        self._deadline_ns = 0
-        self._timer: Timer | None = None
-        self._missing = False
-
-    def asked(self) -> None:
-        """Take a remote frame."""
-        if self._heartbeat_ms is not None and self._heartbeat_ms.integer():
-            return  # a node does not guard and send heartbeats at once
-        self._answer(self._toggle)
-        self._toggle ^= TOGGLE
-        if self._missing:
-            self._missing = False
-            self._regained()
-        self._deadline_ns = self._schedule.now_ns + self._life_ns()
-        if self._timer is None and self._life_ns():
-            self._plan()
-
-    def _life_ns(self) -> int:
-        return self._guard_ms.integer() * self._factor.integer() * _MS
-
-    def _plan(self) -> None:
-        self._timer = self._schedule.at(self._deadline_ns, self._check)
-
-    def _check(self) -> None:
-        self._timer = None
-        if not self._life_ns():
-            return
-        if self._deadline_ns > self._schedule.now_ns:
-            self._plan()
-            return
-        self._missing = True
-        self._lost()

@@ -1,16 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Heartbeat, emergency messages, error register and history (CiA 301: 7.2.7, 7.2.8.2.2, objects 0x1001 to 0x1017)."""
+"""Heartbeat, node guarding, emergency messages, error register and history (CiA 301: 7.2.7, 7.2.8, 0x1001 to 0x1017)."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import NS, Schedule, Timer
-from pmsmtool.sim.node.dictionary import Dictionary, Refused
+from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+
+if TYPE_CHECKING:
+    from pmsmtool.sim.node.session import Session
 
 CONSUMERS = 4
+TOGGLE = 0x80
+"""Bit of the answer to a remote frame that changes from one to the next."""
 _MS = 1_000_000
 
 
@@ -125,6 +131,83 @@ class HeartbeatConsumer:
         self._forget(node)
         self._missing.add(node)
         self._lost(node)
+
+
+class NodeGuarding:
+    """Answers the master's remote frames, and watches that they come.
+
+    It watches from the first remote frame on, and only while there is a life time (0x100C x 0x100D) and no heartbeat.
+
+    Parameters
+    ----------
+    guard_ms, factor, heartbeat_ms : Entry
+        Objects 0x100C, 0x100D and 0x1017.
+    schedule : Schedule
+        Of the session.
+    answer : callable
+        Sends the NMT state with the toggle bit (0 or ``TOGGLE``).
+    lost, regained : callable
+        Called when no remote frame came within the life time; when one comes again.
+    """
+
+    def __init__(
+        self,
+        guard_ms: Entry,
+        factor: Entry,
+        heartbeat_ms: Entry | None,
+        schedule: Schedule,
+        answer: Callable[[int], None],
+        lost: Callable[[], None],
+        regained: Callable[[], None],
+    ) -> None:
+        self._guard_ms, self._factor, self._heartbeat_ms = guard_ms, factor, heartbeat_ms
+        self._schedule = schedule
+        self._answer, self._lost, self._regained = answer, lost, regained
+        self._toggle = 0
+        self._deadline_ns = 0
+        self._timer: Timer | None = None
+        self._missing = False
+
+    def asked(self) -> None:
+        """Take a remote frame."""
+        if self._heartbeat_ms is not None and self._heartbeat_ms.integer():
+            return  # a node does not guard and send heartbeats at once
+        self._answer(self._toggle)
+        self._toggle ^= TOGGLE
+        if self._missing:
+            self._missing = False
+            self._regained()
+        self._deadline_ns = self._schedule.now_ns + self._life_ns()
+        if self._timer is None and self._life_ns():
+            self._plan()
+
+    def _life_ns(self) -> int:
+        return self._guard_ms.integer() * self._factor.integer() * _MS
+
+    def _plan(self) -> None:
+        self._timer = self._schedule.at(self._deadline_ns, self._check)
+
+    def _check(self) -> None:
+        self._timer = None
+        if not self._life_ns():
+            return
+        if self._deadline_ns > self._schedule.now_ns:
+            self._plan()
+            return
+        self._missing = True
+        self._lost()
+
+
+def guarding_of(session: Session) -> NodeGuarding | None:
+    """Return node guarding where the dictionary shows its objects."""
+    entries = {(entry.row.index, entry.row.sub): entry for entry in session.dictionary}
+    guard_ms, factor = entries.get((0x100C, 0)), entries.get((0x100D, 0))
+    if guard_ms is None or factor is None:
+        return None
+    return NodeGuarding(
+        guard_ms, factor, entries.get((0x1017, 0)), session.schedule, session.answer_guarding,
+        lambda: session.power.connection_lost(0), session.power.connection_regained,
+    )  # fmt: skip
 
 
 _EMCY = struct.Struct("<HB5s")

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import Schedule
@@ -22,13 +23,17 @@ from pmsmtool.drive_maps.motion_objects import MotionObject
 from pmsmtool.drive_maps.wire_units import WireUnit, wire_unit
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import BY_NAME, TORQUE_PER_AMPERE
-from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+from pmsmtool.sim.node.dictionary import Dictionary, Entry, Guarding, Refused
+from pmsmtool.sim.node.error_control import guarding_of
 from pmsmtool.sim.node.makers_recorders import Monitor, Rings, TraceRows
 from pmsmtool.sim.node.objects import ObjectRow
 from pmsmtool.sim.node.own_measurements import OsCommands
 from pmsmtool.sim.node.position_modes import INCREMENTS, PID, PROFILE, SPEED, PositionSide, pid_of
 from pmsmtool.sim.node.power_drive import Plant, PowerDrive
 from pmsmtool.units import RAD_S_PER_MRPM
+
+if TYPE_CHECKING:
+    from pmsmtool.sim.node.session import Session
 
 OWN = range(0x2000, 0x6000)
 """Indices of the reference drive's own objects."""
@@ -53,6 +58,29 @@ MODE_BITS = {
 """Bits of object 0x6502."""
 COMMUTATION_ANGLE = 0x60EA
 ANGLE_COUNT_RAD = 2.0 * math.pi / 65536.0
+LACKS: Mapping[str, tuple[int, ...]] = {
+    "copley": (
+        0x1011, 0x1016, 0x1029, 0x6007, 0x605E, 0x6072, 0x6073, 0x6075, 0x6078, 0x6079, 0x607F, 0x6080, 0x608F, 0x6402,
+    ),
+    "elmo": (0x1015, 0x6079, 0x60B2),
+    "epos2": (
+        0x1015, 0x1029, 0x605A, 0x6072, 0x6073, 0x6074, 0x6075, 0x6076, 0x6077, 0x6079, 0x6080, 0x6087, 0x608F, 0x60B2,
+        0x60FD, 0x6403, 0x6404,
+    ),
+    "epos4": (
+        0x1015, 0x6072, 0x6073, 0x6074, 0x6075, 0x6078, 0x6079, 0x607C, 0x6087, 0x608F, 0x6403, 0x6404,
+    ),
+    "faulhaber": (
+        0x1015, 0x6007, 0x605A, 0x605E, 0x6065, 0x6072, 0x6073, 0x6074, 0x6075, 0x6076, 0x6077, 0x6079, 0x6080, 0x6087,
+        0x60B2, 0x60C2, 0x6402, 0x6403, 0x6404,
+    ),
+    "nanotec": (0x1015, 0x6076, 0x6078, 0x6079, 0x6402, 0x6403, 0x6404),
+    "zeroerr": (0x1011, 0x1015, 0x6007, 0x605A, 0x6072, 0x6073, 0x6402, 0x6403, 0x6404),
+}  # fmt: skip
+"""Objects of CiA 301 and CiA 402 that no public EDS of a maker has (the files that its map names as ``eds``), of those
+that others' have. ZeroErr has no 0x608F either, which stays: the simulated encoder is not its own."""
+GUARDING = (0x100C, "UNSIGNED16", "Guard time"), (0x100D, "UNSIGNED8", "Life time factor")
+"""Of a drive without consumer heartbeat."""
 LEVEL_HIDES = {"inject": (0x2063, 0x2064), "recorder": (0x2050, 0x2051, 0x2052, 0x2063, 0x2064)}
 """What a reduced reference drive does not have: window averages; the excitation and current set-points too."""
 RECORDERS: Mapping[str, Callable[[DriveMap, Dictionary, Plant], object]] = {
@@ -118,8 +146,16 @@ class Face:
         if not self.drive_map.capabilities.velocity_mode:
             hidden |= {0x60FF}
         own = {name: row for name, row in self.drive_map.motion.items() if name in BEHIND and row.index}
+        hidden.update(LACKS.get(self.drive_map.name, ()))
         for index in hidden:
             dictionary.hide(index)
+        if 0x1016 in hidden:
+            for index, wire, name in GUARDING:
+                dictionary.show(Entry(_row(index, 0, wire, name, "rw", "0", True), 0))
+        if 0x6007 in hidden:  # a lost master is a fault then, and takes the voltage away
+            dictionary["cia402.abort_connection"].put(1)
+            if 0x605E in hidden:
+                dictionary["cia402.fault_reaction"].put(0)
         for name, signal in self.drive_map.signals.items():
             dictionary.show(_signal_entry(name, signal, dictionary))
         for name, row in own.items():
@@ -146,8 +182,9 @@ class Face:
         if self.drive_map.vendor_tuning is not None:
             OsCommands(self.drive_map.vendor_tuning, dictionary, plant, power, schedule)
 
-    def guarding(self, session: object) -> None:
-        """Return none: a family is shown without node guarding."""
+    def guarding(self, session: Session) -> Guarding | None:
+        """Return node guarding where the family has it."""
+        return guarding_of(session)
 
 
 @dataclass(frozen=True, slots=True)
