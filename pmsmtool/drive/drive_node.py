@@ -27,7 +27,8 @@ from pmsmtool.cia402 import (
 from pmsmtool.drive import objects
 from pmsmtool.drive.objects import LAST_AXIS, DriveObject, of_axis
 from pmsmtool.drive.port import Identity
-from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
+from pmsmtool.drive_maps.drive_map import LETTERS, DriveMap, reference_map
+from pmsmtool.drive_maps.wire_units import wire_unit
 from pmsmtool.errors import BusError, DriveFault, DriveTimeout, NotAvailable, SdoAbort
 from pmsmtool.plain_text import one_line
 
@@ -337,20 +338,28 @@ class DriveNode:
         )
 
     def _kept_off_by(self) -> str:
-        """Return why the drive may not enable: its DC link (0x6079), where shown, separates supply and inputs."""
+        """Return why the drive may not enable: its DC link, where shown, separates supply and inputs."""
         if not self.whole(objects.STATUSWORD) & Status.REMOTE:
             return (
                 "it takes no commands from the bus (statusword, bit 9: remote): its maker's software, a panel or "
                 "an input has the control"
             )
-        link_mv = self.held(objects.DC_LINK_MV)
-        if link_mv is None:
+        link_v = self.link_v()
+        if link_v is None:
             return "no DC-link voltage, or a missing hardware enable or safe-torque-off input"
-        if 1e-3 * link_mv < LEAST_LINK_V:
-            return (
-                f"the supply of the power stage is off: the DC link has {1e-3 * link_mv:.3g} V, where 0x6079 counts mV"
-            )
-        return f"the safe-torque-off (STO) or enable input is open; the DC link has {1e-3 * link_mv:.4g} V"
+        if link_v < LEAST_LINK_V:
+            counts = "" if "U_dc_v" in self.map.signals else ", where 0x6079 counts mV"
+            return f"the supply of the power stage is off: the DC link has {link_v:.3g} V{counts}"
+        return f"the safe-torque-off (STO) or enable input is open; the DC link has {link_v:.4g} V"
+
+    def link_v(self) -> float | None:
+        """Return the voltage of the DC link by the object that the map names, else by 0x6079; None: it is not shown."""
+        signal = self.map.signals.get("U_dc_v")
+        item = objects.DC_LINK_MV
+        if signal is not None:
+            item = DriveObject(signal.index, signal.sub, LETTERS[signal.wire])
+        held = self.held(item)
+        return None if held is None else held * (1e-3 if signal is None else wire_unit(signal.unit).scale)
 
     def disable_voltage(self, timeout_s: float = STATE_TIMEOUT_S) -> State | None:
         """Remove the voltage; return the state that the statusword then shows."""

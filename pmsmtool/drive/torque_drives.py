@@ -67,9 +67,9 @@ class TorqueDrive(TorqueCurrent, StandardDrive):
             return super().live(name)
         try:
             signal = self.node.map.signals.get(name)
-            if signal is None and name == "U_dc_v":
-                return 1e-3 * self.node.get(objects.DC_LINK_MV)
-            if signal is not None:
+            if name == "U_dc_v" and (link_v := self.node.link_v()) is not None:
+                return link_v
+            if signal is not None and name != "U_dc_v":
                 shown = objects.DriveObject(signal.index, signal.sub, LETTERS[signal.wire])
                 return wire_unit(signal.unit).scale * self.node.get(shown)
         except SdoAbort as abort:

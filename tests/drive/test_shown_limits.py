@@ -9,7 +9,7 @@ from typing import cast
 
 import pytest
 
-from pmsmtool.drive.guard import GuardedDrive, guarded
+from pmsmtool.drive.guard import WATCH_S, GuardedDrive, guarded
 from pmsmtool.drive.port import Drive
 from pmsmtool.drive.standard_drive import TorqueCurrent
 from pmsmtool.drive.torque_drives import TorqueDrive
@@ -32,7 +32,7 @@ from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.node.factory import set_up_values
 from pmsmtool.sim.node.power_drive import RAD_S_PER_MRPM, PowerDrive
 from pmsmtool.sim.node.session import Session
-from tests.drive.test_limits_contract import ENVELOPE, POLE_PAIRS, Rig, opened
+from tests.drive.test_limits_contract import ENVELOPE, POLE_PAIRS, STOP_S, Rig, opened, stopped
 
 SHOWN = 0.06
 """What a limit was shown to keep, relative: measured within 0.004 by the current, 0.037 by the way of the shaft."""
@@ -162,3 +162,12 @@ def test_a_limit_that_does_not_act_is_kept_with_the_run(tmp_path: Path, monkeypa
     (tmp_path / FACTS).write_text(dump_facts(facts), encoding="utf-8")
     kept = read_facts(RunDirectory(tmp_path))
     assert kept is not None and kept.limit == facts.limit
+
+
+@pytest.mark.parametrize("name", ["full", "recorder"])
+def test_a_value_that_is_no_number(name: str, tmp_path: Path) -> None:
+    """A drive that shows NaN keeps no limit; those of the standard's objects show whole numbers."""
+    for what in ("current", "speed"):
+        with opened(name, tmp_path) as rig:
+            show = rig.show_current if what == "current" else rig.show_turning
+            stopped(rig, ENVELOPE, lambda guard: show(math.nan), what, WATCH_S + STOP_S)  # noqa: B023

@@ -41,6 +41,16 @@ def identity(vendor: int, product: int) -> tuple[Row, ...]:
     )  # fmt: skip
 
 
+CIA402: tuple[Row, ...] = (
+    *COMMON, *HEARTBEAT, *TORQUE, *identity(0x1234, 1), (0x6007, 0, "I16", "rw", "1"), (0x605A, 0, "I16", "rw", "2"),
+    (0x605E, 0, "I16", "rw", "2"), (0x6062, 0, "I32", "ro", "0"), (0x606C, 0, "I32", "ro", "0"),
+    (0x6073, 0, "U16", "rw", "0"), (0x6075, 0, "U32", "rw", "0"), (0x6078, 0, "I16", "ro", "0"),
+    (0x607A, 0, "I32", "rw", "0"), (0x6080, 0, "U32", "rw", "50000"), (0x608F, 1, "U32", "rw", "4096"),
+    (0x608F, 2, "U32", "rw", "1"), (0x60FF, 0, "I32", "rw", "0"), (0x6502, 0, "U32", "ro", "0x00d"),
+)  # fmt: skip
+"""Of a drive with profile position, velocity and torque mode: what the standard says of its limits, and no more."""
+
+
 def epos4(modes: int = 0x225, product: int = 0x65510000) -> tuple[Row, ...]:
     """Currents and torque constant in 0x3001, torque by mode 10 only, no 0x6073, 0x6075, 0x6078, 0x608F."""
     return (

@@ -33,8 +33,8 @@ from pmsmtool.sim.foreign.position import PositionLoop
 from pmsmtool.sim.foreign.trace import MARKS as TRACE_MARKS
 from pmsmtool.sim.foreign.trace import RowTrace
 from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
-from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.node.error_control import NodeGuarding, guarding_of
+from pmsmtool.sim.node.factory import SET_UP_BANDWIDTH
 from pmsmtool.sim.node.node import VENDOR
 
 if TYPE_CHECKING:

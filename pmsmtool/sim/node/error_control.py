@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Heartbeat, node guarding, emergency messages, error register and history (CiA 301: 7.2.7, 7.2.8, 0x1001 to 0x1017)."""
+"""Heartbeat, node guarding, emergencies, error register and history (CiA 301: 7.2.7, 7.2.8, 0x1001 to 0x1017)."""
 
 from __future__ import annotations
 
