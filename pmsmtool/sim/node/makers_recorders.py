@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -54,7 +54,7 @@ class Rings(RecorderFace):
         self._keep(epos2.PERIOD, (10).to_bytes(2, "little"))
         for k in range(epos2.VARIABLES):
             for first in (epos2.FIRST_INDEX, epos2.FIRST_SUB):
-                self._takes(_of(first, k), self._choose(_of(first, k)))
+                self._takes(_of(first, k), partial(self._choose, _of(first, k)))
         self._takes(epos2.CONTROL, self._control, (epos2.START, epos2.FORCE_TRIGGER, epos2.STOP))
         self._shows(epos2.STATUS, self._status)
         self._shows(epos2.LARGEST, self._largest)
@@ -64,16 +64,13 @@ class Rings(RecorderFace):
 
     # ---- set-up --------------------------------------------------------------------------------
 
-    def _choose(self, address: Address) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            if self._is_running():
-                raise Refused(AbortCode.DEVICE_STATE)
-            index = int.from_bytes(data, "little")
-            if address[0] == epos2.FIRST_INDEX[0] and index and index not in {place[0] for place in self._known}:
-                raise Refused(AbortCode.NOT_MAPPABLE)
-            self._keep(address, data)
-
-        return sink
+    def _choose(self, address: Address, data: bytes) -> None:
+        if self._is_running():
+            raise Refused(AbortCode.DEVICE_STATE)
+        index = int.from_bytes(data, "little")
+        if address[0] == epos2.FIRST_INDEX[0] and index and index not in {place[0] for place in self._known}:
+            raise Refused(AbortCode.NOT_MAPPABLE)
+        self._keep(address, data)
 
     def _chosen(self) -> list[tuple[str, Channel]]:
         places = [
@@ -177,19 +174,16 @@ class Monitor(RecorderFace):
         self._takes(ingenia.REMOVE_DATA, self._remove, (1,))
         self._takes(ingenia.FORCE_TRIGGER, self._trigger, (1,))
         for k in range(ingenia.CHANNELS):
-            self._takes(_map_word(k), self._map(_map_word(k)))
+            self._takes(_map_word(k), partial(self._map, _map_word(k)))
         self._gives(ingenia.DATA, self._block)
 
     # ---- set-up --------------------------------------------------------------------------------
 
-    def _map(self, address: Address) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            word = int.from_bytes(data, "little")
-            if self._running or (word and ingenia.mapped_index(word) not in self._cells):
-                raise Refused(AbortCode.NOT_MAPPABLE)
-            self._keep(address, data)
-
-        return sink
+    def _map(self, address: Address, data: bytes) -> None:
+        word = int.from_bytes(data, "little")
+        if self._running or (word and ingenia.mapped_index(word) not in self._cells):
+            raise Refused(AbortCode.NOT_MAPPABLE)
+        self._keep(address, data)
 
     def _mapped(self) -> list[tuple[str, SignalCell]]:
         words = [self._number(_map_word(k)) for k in range(self._number(ingenia.MAPPED))]
@@ -264,22 +258,19 @@ class TraceRows(RecorderFace):
         self._shows(copley.LARGEST, self._largest)
         self._takes(copley.START, self._start, (0, 1))
         for k in range(copley.CHANNELS):
-            self._takes(_channel(k), self._choose(_channel(k)))
+            self._takes(_channel(k), partial(self._choose, _channel(k)))
         self._gives(copley.DATA, self._data)
         dictionary.show(_trigger_entry())
 
     # ---- set-up --------------------------------------------------------------------------------
 
-    def _choose(self, address: Address) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            number = int.from_bytes(data, "little")
-            if self._is_running():
-                raise Refused(AbortCode.DEVICE_STATE)
-            if number and number not in self._known:
-                raise Refused(AbortCode.VALUE)
-            self._keep(address, data)
-
-        return sink
+    def _choose(self, address: Address, data: bytes) -> None:
+        number = int.from_bytes(data, "little")
+        if self._is_running():
+            raise Refused(AbortCode.DEVICE_STATE)
+        if number and number not in self._known:
+            raise Refused(AbortCode.VALUE)
+        self._keep(address, data)
 
     def _chosen(self) -> list[tuple[str, Channel]]:
         numbers = [self._number(_channel(k)) for k in range(copley.CHANNELS)]

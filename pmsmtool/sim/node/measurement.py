@@ -11,6 +11,7 @@ import math
 import struct
 import zlib
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.cia402 import EXCITATION_ABORTED, Mode, State
@@ -124,14 +125,11 @@ class Measurement:
         self._live_source("governor.binding", Signal.BINDING)
         self._source("governor.horizon_used", lambda: self._plant.parameter("governor.k_max"))
 
-    def _word_sink(self, key: str) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            word = int.from_bytes(data, "little")
-            if word and word not in self._signals:
-                raise Refused(AbortCode.NOT_MAPPABLE)
-            self._dictionary[key].value = data
-
-        return sink
+    def _take_word(self, key: str, data: bytes) -> None:
+        word = int.from_bytes(data, "little")
+        if word and word not in self._signals:
+            raise Refused(AbortCode.NOT_MAPPABLE)
+        self._dictionary[key].value = data
 
     def _channels(self, prefix: str) -> Sequence[Signal]:
         words = [self._dictionary[f"{prefix}.channel_{number + 1}"].integer() for number in range(TRACE_CHANNELS)]
@@ -147,7 +145,7 @@ class Measurement:
         buffer = entries["excitation.buffer"]
         self._source("excitation.buffer_samples", lambda: len(buffer.value) // 4)
         for name in _WHILE_RUNNING:
-            entries[f"excitation.{name}"].sink = self._running_sink(f"excitation.{name}")
+            entries[f"excitation.{name}"].sink = partial(self._change_running, f"excitation.{name}")
 
     def _write_buffer(self, data: bytes) -> None:
         if len(data) % 4 or len(data) > 4 * BUFFER_SAMPLES:
@@ -156,14 +154,11 @@ class Measurement:
             raise Refused(AbortCode.VALUE)
         self._dictionary["excitation.buffer"].value = data
 
-    def _running_sink(self, key: str) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            self._dictionary[key].value = data
-            self._plant.look()
-            if self._plant.core.excitation_state() is ExcitationState.RUNNING:
-                self._plant.core.excite(self._excitation())
-
-        return sink
+    def _change_running(self, key: str, data: bytes) -> None:
+        self._dictionary[key].value = data
+        self._plant.look()
+        if self._plant.core.excitation_state() is ExcitationState.RUNNING:
+            self._plant.core.excite(self._excitation())
 
     def _excitation(self) -> Excitation:
         entries = self._dictionary.by_key
@@ -230,7 +225,7 @@ class Measurement:
         entries = self._dictionary.by_key
         entries["trace.command"].sink = self._command_recorder
         for key in ("trace.source", *(f"trace.channel_{number + 1}" for number in range(TRACE_CHANNELS))):
-            entries[key].sink = self._word_sink(key)
+            entries[key].sink = partial(self._take_word, key)
         core = self._plant.core
         self._source("trace.state", lambda: core.recorder().state)
         self._source("trace.stored", lambda: core.recorder().stored)
@@ -290,17 +285,14 @@ class Measurement:
         self._source("average.state", lambda: self._plant.core.averages().state)
         for number in range(TRACE_CHANNELS):
             key = f"average.channel_{number + 1}"
-            entries[key].sink = self._word_sink(key)
-            self._source(f"average.mean_{number + 1}", self._average(number, lambda result: result.mean))
-            self._source(f"average.std_{number + 1}", self._average(number, lambda result: result.std))
+            entries[key].sink = partial(self._take_word, key)
+            self._source(f"average.mean_{number + 1}", partial(self._averaged, number, lambda result: result.mean))
+            self._source(f"average.std_{number + 1}", partial(self._averaged, number, lambda result: result.std))
 
-    def _average(self, number: int, pick: Callable[[Averages], Sequence[float]]) -> Callable[[], float]:
-        def value() -> float:
-            result = self._plant.core.averages()
-            values = pick(result)
-            return values[number] if result.state is AverageState.COMPLETE and number < len(values) else math.nan
-
-        return value
+    def _averaged(self, number: int, pick: Callable[[Averages], Sequence[float]]) -> float:
+        result = self._plant.core.averages()
+        values = pick(result)
+        return values[number] if result.state is AverageState.COMPLETE and number < len(values) else math.nan
 
     def _command_averages(self, data: bytes) -> None:
         self._plant.look()

@@ -16,6 +16,7 @@ import struct
 import zlib
 from collections.abc import Callable, Collection, Iterator, Mapping
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -266,23 +267,20 @@ class Store:
         self._step_done = step_done
         self._busy = False
         for groups, key in ((_ALL, "all"), *(((group,), group.value[0]) for group in Group)):
-            dictionary[f"store.{key}"].sink = self._sink(b"save", groups)
-            dictionary[f"restore.{key}"].sink = self._sink(b"load", groups)
+            dictionary[f"store.{key}"].sink = partial(self._take, b"save", groups)
+            dictionary[f"restore.{key}"].sink = partial(self._take, b"load", groups)
 
-    def _sink(self, signature: bytes, groups: tuple[Group, ...]) -> Callable[[bytes], bool]:
-        def sink(data: bytes) -> bool:
-            if data != signature:
-                raise Refused(AbortCode.NOT_STORED)
-            if self._energised() or self._busy:
-                raise Refused(AbortCode.DEVICE_STATE)
-            content = without(self.stored, groups)
-            if signature == b"save":
-                for group in groups:
-                    content |= self._current(group)
-            self.write(content, self._finish)
-            return True
-
-        return sink
+    def _take(self, signature: bytes, groups: tuple[Group, ...], data: bytes) -> bool:
+        if data != signature:
+            raise Refused(AbortCode.NOT_STORED)
+        if self._energised() or self._busy:
+            raise Refused(AbortCode.DEVICE_STATE)
+        content = without(self.stored, groups)
+        if signature == b"save":
+            for group in groups:
+                content |= self._current(group)
+        self.write(content, self._finish)
+        return True
 
     @property
     def busy(self) -> bool:

@@ -13,6 +13,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from enum import IntEnum
+from functools import partial
 from itertools import pairwise
 
 from pmsmtool.bus.abort_codes import AbortCode
@@ -208,10 +209,10 @@ class ParameterSet:
         for row in CATALOGUE:
             entry = entries[row.name]
             entry.source = self._parameter_source(row, entry.size)
-            entry.sink = self._parameter_sink(row)
+            entry.sink = partial(self._take_parameter, row)
         for key in PARTS:
             entries[key].source = self._part_source(key)
-            entries[key].sink = self._part_sink(key)
+            entries[key].sink = partial(self._take_part, key)
         entries["parameter_set.image"].source = lambda: self._shown().pack()
         entries["parameter_set.image"].sink = self._write_image
         entries["parameter_set.command"].sink = self._command
@@ -231,33 +232,27 @@ class ParameterSet:
     def _parameter_source(self, row: Parameter, size: int) -> Callable[[], bytes]:
         return lambda: (self.staging or self.active).wire(row, size)
 
-    def _parameter_sink(self, row: Parameter) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            if self.staging is not None:
-                self.staging.set_wire(row, data)
-                self._restage()
-                return
-            if row.name.startswith(("lut.", "saturation.")) or (self._energised() and not row.live):
-                raise Refused(AbortCode.DEVICE_STATE)
-            self.active.set_wire(row, data)
-            self.state = SetState.NONE
-            self.announce()
-
-        return sink
+    def _take_parameter(self, row: Parameter, data: bytes) -> None:
+        if self.staging is not None:
+            self.staging.set_wire(row, data)
+            self._restage()
+            return
+        if row.name.startswith(("lut.", "saturation.")) or (self._energised() and not row.live):
+            raise Refused(AbortCode.DEVICE_STATE)
+        self.active.set_wire(row, data)
+        self.state = SetState.NONE
+        self.announce()
 
     def _part_source(self, key: str) -> Callable[[], bytes]:
         return lambda: self._shown().parts[key]
 
-    def _part_sink(self, key: str) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            if self.staging is None:
-                raise Refused(AbortCode.DEVICE_STATE)
-            if len(data) > _MAX_LUT_BYTES:
-                raise Refused(AbortCode.TOO_LONG)
-            self.staging.parts[key] = data
-            self._restage()
-
-        return sink
+    def _take_part(self, key: str, data: bytes) -> None:
+        if self.staging is None:
+            raise Refused(AbortCode.DEVICE_STATE)
+        if len(data) > _MAX_LUT_BYTES:
+            raise Refused(AbortCode.TOO_LONG)
+        self.staging.parts[key] = data
+        self._restage()
 
     def _shown(self) -> ParameterImage:
         return self.staging or self.active

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.clock import Schedule, Timer
@@ -92,54 +93,42 @@ class ProcessData:
 
     def _hook(self, pdo: _Pdo) -> None:
         entries = self._dictionary.by_key
-        entries[f"{pdo.name}.cob_id"].sink = self._cob_id_sink(pdo)
-        entries[f"{pdo.name}.count"].sink = self._count_sink(pdo)
+        entries[f"{pdo.name}.cob_id"].sink = partial(self._take_cob_id, pdo)
+        entries[f"{pdo.name}.count"].sink = partial(self._take_count, pdo)
         for number in range(MAX_OBJECTS):
-            entries[f"{pdo.name}.object_{number + 1}"].sink = self._object_sink(pdo, number)
+            entries[f"{pdo.name}.object_{number + 1}"].sink = partial(self._take_object, pdo, number)
         for key in ("type", "event_ms"):
             if f"{pdo.name}.{key}" in entries:
-                entries[f"{pdo.name}.{key}"].sink = self._plain_sink(f"{pdo.name}.{key}")
+                entries[f"{pdo.name}.{key}"].sink = partial(self._take_plain, f"{pdo.name}.{key}")
 
-    def _plain_sink(self, key: str) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            if key.endswith("type") and 241 <= data[0] <= 253:
-                raise Refused(AbortCode.VALUE)  # reserved, or on remote request only
-            self._dictionary[key].value = data
-            self.configure()
+    def _take_plain(self, key: str, data: bytes) -> None:
+        if key.endswith("type") and 241 <= data[0] <= 253:
+            raise Refused(AbortCode.VALUE)  # reserved, or on remote request only
+        self._dictionary[key].value = data
+        self.configure()
 
-        return sink
+    def _take_cob_id(self, pdo: _Pdo, data: bytes) -> None:
+        entry = self._dictionary[f"{pdo.name}.cob_id"]
+        old, new = entry.integer(), int.from_bytes(data, "little")
+        if new & 0x1FFFF800 or (not (old | new) & _OFF and (old ^ new) & 0x7FF):
+            raise Refused(AbortCode.VALUE)  # 29-bit identifiers; or a valid PDO's identifier changed
+        entry.value = data
+        self.configure()
 
-    def _cob_id_sink(self, pdo: _Pdo) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            entry = self._dictionary[f"{pdo.name}.cob_id"]
-            old, new = entry.integer(), int.from_bytes(data, "little")
-            if new & 0x1FFFF800 or (not (old | new) & _OFF and (old ^ new) & 0x7FF):
-                raise Refused(AbortCode.VALUE)  # 29-bit identifiers; or a valid PDO's identifier changed
-            entry.value = data
-            self.configure()
+    def _take_object(self, pdo: _Pdo, number: int, data: bytes) -> None:
+        if self._number(pdo, "count"):
+            raise Refused(AbortCode.ACCESS)
+        word = int.from_bytes(data, "little")
+        if word:
+            self._mapped(pdo, word)
+        self._dictionary[f"{pdo.name}.object_{number + 1}"].value = data
 
-        return sink
-
-    def _object_sink(self, pdo: _Pdo, number: int) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            if self._number(pdo, "count"):
-                raise Refused(AbortCode.ACCESS)
-            word = int.from_bytes(data, "little")
-            if word:
-                self._mapped(pdo, word)
-            self._dictionary[f"{pdo.name}.object_{number + 1}"].value = data
-
-        return sink
-
-    def _count_sink(self, pdo: _Pdo) -> Callable[[bytes], None]:
-        def sink(data: bytes) -> None:
-            if not self._number(pdo, "cob_id") & _OFF:
-                raise Refused(AbortCode.ACCESS)
-            self._collect(pdo, data[0])
-            self._dictionary[f"{pdo.name}.count"].value = data
-            self.configure()
-
-        return sink
+    def _take_count(self, pdo: _Pdo, data: bytes) -> None:
+        if not self._number(pdo, "cob_id") & _OFF:
+            raise Refused(AbortCode.ACCESS)
+        self._collect(pdo, data[0])
+        self._dictionary[f"{pdo.name}.count"].value = data
+        self.configure()
 
     def _mapped(self, pdo: _Pdo, word: int) -> tuple[Entry, int]:
         if pdo.name.startswith("rpdo") and word == DUMMY_BYTE:
