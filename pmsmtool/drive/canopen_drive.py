@@ -72,8 +72,11 @@ class CanopenDrive:
         self.parameters = DriveParameters(self.node)
         self.may_be_energised = False
         self.identity = self.node.identity()
-        self.period_s = 1e-9 * self.parameters.read_value(PERIOD)
+        self.period_s = self._control_period_s()
         self.recorder = Recorder(self.node, self.period_s)
+
+    def _control_period_s(self) -> float:
+        return 1e-9 * self.parameters.read_value(PERIOD)
 
     def close(self) -> None:
         """Stop listening to the drive."""
@@ -133,7 +136,7 @@ class CanopenDrive:
         """Write contents by name while the drive is off, and read them back."""
         self.parameters.replace(changed)
         if PERIOD in changed:
-            self.period_s = 1e-9 * self.parameters.read_value(PERIOD)
+            self.period_s = self._control_period_s()
 
     # ---- states ---------------------------------------------------------------------------------
 

@@ -32,7 +32,6 @@ from pmsmtool.drive.motion_objects import (
     torque_target,
 )
 from pmsmtool.drive.objects import DriveObject
-from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Excitation, Injection, Recording, Shape
 from pmsmtool.drive.recorders.reference import Recorder
 from pmsmtool.drive_maps.drive_map import DriveMap
@@ -74,11 +73,7 @@ class StandardDrive(CanopenDrive):
     commands_bounded_current = True
 
     def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
-        self.node = DriveNode(connection, node_id, drive_map=drive_map)
-        self.parameters = DriveParameters(self.node)
-        self.may_be_energised = False
-        self.identity = self.node.identity()
-        self.period_s = POLL_PERIOD_S
+        super().__init__(connection, node_id, drive_map=drive_map)
         self.recorder: Recorder = PolledMeans(self.node, self.live)
         self._last_counts: float | None = None
         self._since: tuple[float, float] = (0.0, 0.0)  # counts, and the instant (s) before they were asked for
@@ -89,6 +84,9 @@ class StandardDrive(CanopenDrive):
         self._current = shown_current(self.node, self._rated_apk)
         bits = 8 * self.node.typed(self._current.item).size
         self.shows_apk = self._current.per_count * ((1 << bits - 1) - 1)
+
+    def _control_period_s(self) -> float:
+        return POLL_PERIOD_S
 
     @property
     def rated_apk(self) -> float:

@@ -16,11 +16,8 @@ import numpy as np
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
-from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.motion_objects import LimitedSpeed, limited_speed, torque_target, undecided
-from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Recording
-from pmsmtool.drive.recorders.reference import Recorder
 from pmsmtool.drive.standard_drive import POLL_PERIOD_S, StandardDrive, TorqueCurrent
 from pmsmtool.drive_maps.drive_map import LETTERS, DriveMap
 from pmsmtool.drive_maps.wire_units import wire_unit
@@ -31,13 +28,8 @@ from pmsmtool.trace import Trace
 class ParameterDrive(CanopenDrive):
     """A drive that holds parameters and is not moved."""
 
-    def __init__(self, connection: Connection, node_id: int, *, drive_map: DriveMap | None = None) -> None:
-        self.node = DriveNode(connection, node_id, drive_map=drive_map)
-        self.parameters = DriveParameters(self.node)
-        self.may_be_energised = False
-        self.identity = self.node.identity()
-        self.period_s = POLL_PERIOD_S
-        self.recorder = Recorder(self.node, POLL_PERIOD_S)
+    def _control_period_s(self) -> float:
+        return POLL_PERIOD_S
 
 
 class TorqueDrive(TorqueCurrent, StandardDrive):
