@@ -10,13 +10,12 @@ import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, at_most, near
+from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table
 from pmsmtool.papers.polar_scene import (
     ASSUMED,
     BASELINES,
     CONVENTIONAL,
     CONVENTIONAL_ON_MEASUREMENT,
-    EXPECTED,
     K_T,
     LINEAR,
     M_PER_V,
@@ -32,7 +31,9 @@ from pmsmtool.papers.polar_scene import (
     V_MAX,
     Controller,
     Response,
+    at_most,
     machine_file,
+    near,
     run,
     steps,
 )
@@ -130,12 +131,7 @@ def _modulator(seed: int) -> tuple[Table, list[Check], list[tuple[float, Held]]]
     worst = max(abs(m.fundamental - float(own)) for (_, m), own in zip(found, expected, strict=True))
     checks = [
         at_most(
-            "fundamental: closed loop against the legs' geometry",
-            worst,
-            0.01,
-            "1",
-            expected=0.0,
-            where="own statement",
+            "fundamental: closed loop against the legs' geometry", worst, 0.01, "1", expected=0.0, where="own statement"
         ),
         near(
             "fundamental without limit on V_a: six-step",
@@ -242,7 +238,7 @@ def _out_of_reach(seed: int) -> tuple[Table, list[Check], list[tuple[str, Respon
             ),
             at_most(f"{law.name}: largest current, peak", peak_current_apk(r), 40.0, "A", where="I_max of the profile"),
         ]
-    checks.append(at_most("unified: settling after the return", results[UNIFIED.name][2], 3.0, "ms", where=EXPECTED))
+    checks.append(at_most("unified: settling after the return", results[UNIFIED.name][2], 3.0, "ms"))
     return Table("12 N m asked for at 800 rpm, where 8.42 N m is the most", columns, tuple(rows)), checks, shown
 
 

@@ -8,17 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pmsmtool.papers.figure import (
-    Check,
-    Column,
-    Panel,
-    Reproduction,
-    Series,
-    Table,
-    at_least,
-    at_most,
-    near,
-)
+from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table
 from pmsmtool.papers.polar_scene import (
     ASSUMED,
     BASELINES,
@@ -35,6 +25,9 @@ from pmsmtool.papers.polar_scene import (
     Bench,
     Controller,
     Response,
+    at_least,
+    at_most,
+    near,
     run,
     steps,
 )
@@ -117,9 +110,9 @@ def figure_7(seed: int) -> Reproduction:
     """Fig. 7: linear range at 0 rpm, simulation."""
     m = measured(response(LINEAR, LOW_RPM, seed=seed))
     checks = (
-        near("overshoot at 0 rpm", 18.5, m.over, "%", absolute=1.5, where=EXPECTED),
-        near("settling at 0 rpm", 2.6, m.settle_ms, "ms", absolute=0.3, where=EXPECTED),
-        at_most("peak i_d at 0 rpm", m.i_d_a, 0.01, "A", expected=0.0, where=EXPECTED),
+        near("overshoot at 0 rpm", 18.5, m.over, "%", absolute=1.5),
+        near("settling at 0 rpm", 2.6, m.settle_ms, "ms", absolute=0.3),
+        at_most("peak i_d at 0 rpm", m.i_d_a, 0.01, "A", expected=0.0),
     )
     return _figure(LOW_RPM, SIMULATION, seed, checks)
 
@@ -130,7 +123,7 @@ def figure_8(seed: int) -> Reproduction:
     printed = measured(response(PRINTED, HIGH_RPM, seed=seed))
     blind = measured(response(PRINTED, LOW_RPM, seed=seed))
     checks = (
-        at_most("overshoot at 400 rpm", high.over, 20.5, "%", expected=18.7, where=EXPECTED),
+        at_most("overshoot at 400 rpm", high.over, 20.5, "%", expected=18.7),
         Check("peak i_d at 400 rpm", 0.18, high.i_d_a, "A", 0.1, 0.45, EXPECTED),
         near(
             "settling, 400 rpm over 0 rpm",
@@ -140,9 +133,9 @@ def figure_8(seed: int) -> Reproduction:
             absolute=0.12,
             where="section IV.C",
         ),
-        at_least("(15) as printed: settling at 400 rpm", min(printed.settle_ms, 1e3), 19.9, "ms", where=EXPECTED),
-        at_least("(15) as printed: peak i_d at 400 rpm", printed.i_d_a, 3.0, "A", expected=8.2, where=EXPECTED),
-        near("(15) as printed: overshoot at 0 rpm", 18.5, blind.over, "%", absolute=1.5, where=EXPECTED),
+        at_least("(15) as printed: settling at 400 rpm", min(printed.settle_ms, 1e3), 19.9, "ms"),
+        at_least("(15) as printed: peak i_d at 400 rpm", printed.i_d_a, 3.0, "A", expected=8.2),
+        near("(15) as printed: overshoot at 0 rpm", 18.5, blind.over, "%", absolute=1.5),
     )
     return _figure(HIGH_RPM, SIMULATION, seed, checks)
 
@@ -184,18 +177,9 @@ def compared(seed: int) -> Reproduction:
     for law in (REGULARISED, UNIFIED_TUNED):
         low, high = found[law.name]
         checks += [
-            at_most(
-                f"{law.name}: overshoot, 400 against 0 rpm",
-                abs(high.over - low.over),
-                0.5,
-                "%",
-                expected=0.0,
-                where=EXPECTED,
-            ),
-            at_most(f"{law.name}: overshoot at 400 rpm", high.over, 3.5, "%", expected=2.8, where=EXPECTED),
-            at_most(
-                f"{law.name}: i_d at 400 rpm, of the step", high.i_d_percent, 1.0, "%", expected=0.7, where=EXPECTED
-            ),
+            at_most(f"{law.name}: overshoot, 400 against 0 rpm", abs(high.over - low.over), 0.5, "%", expected=0.0),
+            at_most(f"{law.name}: overshoot at 400 rpm", high.over, 3.5, "%", expected=2.8),
+            at_most(f"{law.name}: i_d at 400 rpm, of the step", high.i_d_percent, 1.0, "%", expected=0.7),
         ]
         worst, same = (max(one.over for one in runs[law.name]) for runs in (late, found))
         checks.append(at_most(f"{law.name}: overshoot, delayed", worst, 4.0, "%", expected=same, where="without delay"))
@@ -265,16 +249,16 @@ def at_zero_voltage(seed: int, realisations: int = 16, spikes: int = 30) -> Repr
             rows.append((law.name, torque, rpm, m.phase_rad, m.i_d_a, m.i_q_a, None, None))
     papers = found[LINEAR.name]
     checks = [
-        near("paper's law: rms phase step", 0.50, papers.phase_rad, "rad", relative=0.3, where=EXPECTED),
-        near("paper's law: std of i_d", 0.0303, papers.i_d_a, "A", relative=0.3, where=EXPECTED),
+        near("paper's law: rms phase step", 0.50, papers.phase_rad, "rad", relative=0.3),
+        near("paper's law: std of i_d", 0.0303, papers.i_d_a, "A", relative=0.3),
     ]
     for law in (REGULARISED, UNIFIED_TUNED):
         m = found[law.name]
         checks += [
-            at_most(f"{law.name}: phase step / paper's", m.phase_rad / papers.phase_rad, 1 / 15, "1", where=EXPECTED),
-            at_most(f"{law.name}: std of i_d / paper's", m.i_d_a / papers.i_d_a, 1.0, "1", where=EXPECTED),
-            at_most(f"{law.name}: std of i_q / paper's", m.i_q_a / papers.i_q_a, 1.0, "1", where=EXPECTED),
-            at_most(f"{law.name}: largest i_d spike", max(m.spikes_a), 0.12, "A", expected=0.07, where=EXPECTED),
+            at_most(f"{law.name}: phase step / paper's", m.phase_rad / papers.phase_rad, 1 / 15, "1"),
+            at_most(f"{law.name}: std of i_d / paper's", m.i_d_a / papers.i_d_a, 1.0, "1"),
+            at_most(f"{law.name}: std of i_q / paper's", m.i_q_a / papers.i_q_a, 1.0, "1"),
+            at_most(f"{law.name}: largest i_d spike", max(m.spikes_a), 0.12, "A", expected=0.07),
         ]
     plots = tuple(
         Panel(law.name, "time / ms", "delta / rad", (Series("delta", 1e3 * r.t, r.delta),))

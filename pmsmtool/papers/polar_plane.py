@@ -30,8 +30,8 @@ from pmsmtool.design.polar_values import (
     share_above,
     stability_map,
 )
-from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table, at_most, near
-from pmsmtool.papers.polar_scene import ASSUMED, EXPECTED, K_T, PEAK, SOURCE, V_MAX, machine_file
+from pmsmtool.papers.figure import Check, Column, Panel, Reproduction, Series, Table
+from pmsmtool.papers.polar_scene import ASSUMED, K_T, PEAK, SOURCE, V_MAX, at_most, machine_file, near
 from pmsmtool.units import RAD_S_PER_RPM
 
 SPEEDS_RPM = np.linspace(0.0, 1400.0, 281)
@@ -89,10 +89,10 @@ def equilibria(seed: int) -> Reproduction:
     far = equilibrium_at_amplitude(m, _omega(800.0), m.current_a(12.0), V_PEAK)
     checks = (
         at_most("largest equilibrium residual", worst, 1e-6, "A/s", expected=0.0, where="f(x_o, u_o) = 0"),
-        near("largest i_q at 800 rpm", 31.9, far.i_q / PEAK, "A", absolute=0.05, where=EXPECTED),
-        near("largest torque at 800 rpm", 8.42, K_T * far.i_q / PEAK, "N m", absolute=0.01, where=EXPECTED),
-        near("i_q at the linear limit, 800 rpm", 13.17, _limit_i_q(800.0), "A", absolute=0.05, where=EXPECTED),
-        near("i_q at the linear limit, 400 rpm", 54.0, _limit_i_q(400.0), "A", absolute=0.3, where=EXPECTED),
+        near("largest i_q at 800 rpm", 31.9, far.i_q / PEAK, "A", absolute=0.05),
+        near("largest torque at 800 rpm", 8.42, K_T * far.i_q / PEAK, "N m", absolute=0.01),
+        near("i_q at the linear limit, 800 rpm", 13.17, _limit_i_q(800.0), "A", absolute=0.05),
+        near("i_q at the linear limit, 400 rpm", 54.0, _limit_i_q(400.0), "A", absolute=0.3),
         *_identities(),
     )
     table = Table("least-loss steady state; out of reach: the largest torque at full voltage", columns, rows)
@@ -207,27 +207,16 @@ def controllability(seed: int) -> Reproduction:
         )
         if math.isfinite(expected):
             what = f"condition number at {rpm:g} rpm, {torque:g} N m"
-            checks.append(near(what, expected, found.condition, "1", relative=0.006, where=EXPECTED))
+            checks.append(near(what, expected, found.condition, "1", relative=0.006))
     for torque, gain, zero_at in ((1.0, 0.88, 6490.0), (4.5, 0.60, 1268.0), (8.0, 0.08, 223.0)):
         found = conditioning(m, _omega(800.0), torque, V_PEAK)
-        checks.append(
-            near(f"relative gain, {torque:g} N m", gain, found.relative_gain_dc, "1", absolute=0.006, where=EXPECTED)
-        )
-        checks.append(near(f"zero, {torque:g} N m", zero_at, found.zero_rad_s, "rad/s", relative=0.003, where=EXPECTED))
+        checks.append(near(f"relative gain, {torque:g} N m", gain, found.relative_gain_dc, "1", absolute=0.006))
+        checks.append(near(f"zero, {torque:g} N m", zero_at, found.zero_rad_s, "rad/s", relative=0.003))
     grid = condition_map(m, V_PEAK, SPEEDS_RPM, TORQUES_NM)
     checks.append(
-        near(
-            "share of the reachable area with condition > 10",
-            6.6,
-            100 * share_above(grid, 10.0),
-            "%",
-            absolute=0.5,
-            where=EXPECTED,
-        )
+        near("share of the reachable area with condition > 10", 6.6, 100 * share_above(grid, 10.0), "%", absolute=0.5)
     )
-    checks.append(
-        near("share with condition > 100", 0.3, 100 * share_above(grid, 100.0), "%", absolute=0.1, where=EXPECTED)
-    )
+    checks.append(near("share with condition > 100", 0.3, 100 * share_above(grid, 100.0), "%", absolute=0.1))
     stability, more = _stability()
     notes = (
         *ASSUMED,
@@ -262,16 +251,7 @@ def _stability() -> tuple[Table, list[Check]]:
     for i_q, expected in ((0.5, -181.0), (13.0, -153.0)):
         found = design_or_none(m, V_PEAK, 800.0, K_T * i_q)
         assert found is not None
-        checks.append(
-            near(
-                f"slowest pole at 800 rpm, {i_q:g} A",
-                expected,
-                found.slowest_rad_s,
-                "rad/s",
-                absolute=1.5,
-                where=EXPECTED,
-            )
-        )
+        checks.append(near(f"slowest pole at 800 rpm, {i_q:g} A", expected, found.slowest_rad_s, "rad/s", absolute=1.5))
     return Table(
         "real part of the slowest pole of the true two-input loop; designed for -600 and -300 rad/s", columns, rows
     ), checks
@@ -354,8 +334,7 @@ def gain_schedules(seed: int) -> Reproduction:
         f"{loop} {name} at 800 rpm, 1 N m" for loop in ("phase", "amplitude") for name in ("K_p", "K_i", "K_d", "a")
     ]
     checks = [
-        near(name, want, got, "as above", relative=0.02, where=EXPECTED)
-        for name, want, got in zip(names, expected, ours, strict=True)
+        near(name, want, got, "as above", relative=0.02) for name, want, got in zip(names, expected, ours, strict=True)
     ]
     speeds = np.linspace(100.0, 1400.0, 131)
     curves = {

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import LINEAR_RANGE, NO_ANTI_WINDUP, ON_MEASUREMENT, POLAR_LAWS, PREDICT, TuneRequest
 from pmsmtool.machine.key import Value
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
+from pmsmtool.papers import figure
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.closed_loop import simulate
 from pmsmtool.sim.kernel import Application
@@ -46,6 +47,9 @@ M_PER_V = 2.0 / (math.sqrt(1.5) * V_DC)
 
 EXPECTED = "derived: the paper's equations on the assumed machine"
 """Where the expected numbers come from: the paper prints none, and its Table I is missing."""
+
+at_least, at_most, near = (partial(check, where=EXPECTED) for check in (figure.at_least, figure.at_most, figure.near))
+"""Checks of a number against one of :data:`EXPECTED`, unless they say where else it comes from."""
 
 ASSUMED = (
     "the paper's Table I is missing: every machine number is assumed (profile miyajima-2013-assumed)",
