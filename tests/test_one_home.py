@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+import pmsmtool
 from pmsmtool.data_types import BY_SHORT, DATA_TYPES
 from tests.test_layers import parsed
 
@@ -49,12 +50,28 @@ def copies(name: str, source: str) -> Iterator[str]:
                 yield f"{name}:{node.lineno}: a table of data types belongs to data_types.py"
 
 
+def listed_fields(name: str, source: str) -> Iterator[str]:
+    """Yield the dataclasses whose docstring writes names and types of their fields a second time.
+
+    ``help()`` shows the list of those that the package gives.
+    """
+    for node in ast.walk(parsed(source)):
+        if not isinstance(node, ast.ClassDef) or node.name in pmsmtool.__all__:
+            continue
+        if "dataclass" in " ".join(map(ast.unparse, node.decorator_list)):
+            fields = {ast.unparse(part.target) for part in node.body if isinstance(part, ast.AnnAssign)}
+            listed = re.findall(r"^(\w+)(?:, \w+)* : ", ast.get_docstring(node) or "", flags=re.MULTILINE)
+            if fields & set(listed):
+                yield f"{name}:{node.lineno}: {node.name}: say what a field holds behind the field"
+
+
 @pytest.mark.chain
 def test_nothing_in_the_package_is_a_copy() -> None:
     found = [
         copy
         for path in sorted(PACKAGE.rglob("*.py"))
-        for copy in copies(path.relative_to(PACKAGE).as_posix(), path.read_text(encoding="utf-8"))
+        for rule in (copies, listed_fields)
+        for copy in rule(path.relative_to(PACKAGE).as_posix(), path.read_text(encoding="utf-8"))
     ]
     assert found == []
 
@@ -84,3 +101,10 @@ def test_a_copy_is_found(line: str) -> None:
 )
 def test_what_only_looks_like_one_is_not(line: str) -> None:
     assert list(copies("design/x.py", line)) == []
+
+
+@pytest.mark.parametrize(("name", "found"), [("Mass", 1), ("Estimate", 0)])
+def test_a_list_of_fields_is_found(name: str, found: int) -> None:
+    doc = '    """One.\n\n    J, B : float\n        Both.\n    """'
+    source = f"@dataclass(frozen=True)\nclass {name}:\n{doc}\n    J: float\n    B: float"
+    assert len(list(listed_fields("design/x.py", source))) == found

@@ -116,28 +116,19 @@ _WATCHED = ("supervision", "abort option", "limits", *_SEEN, "current")
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """An interval measured on simulated drives.
-
-    Attributes
-    ----------
-    name : str
-        Key of the estimate.
-    half_width, unit : float, str
-        90 % of the drives had a total 95 % half width up to this (% of the value, or deg).
-    drives : int
-        Accepted drives behind it.
-    program : str
-        Command that measured it.
-    given : str
-        What must be given for it besides the drive; empty: nothing.
-    """
+    """An interval measured on simulated drives."""
 
     name: str
+    """Key of the estimate."""
     half_width: float
     unit: str
+    """90 % of the drives had a total 95 % half width up to this (% of the value, or deg)."""
     drives: int
+    """Accepted drives behind it."""
     program: str
+    """Command that measured it."""
     given: str = ""
+    """What must be given for it besides the drive; empty: nothing."""
 
     def __str__(self) -> str:
         with_what = f" with {self.given}" if self.given else ""
@@ -146,47 +137,31 @@ class Expected:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """A method of a quantity.
-
-    Attributes
-    ----------
-    needs : tuple of str
-        Keys of :data:`FEATURES`.
-    expected : tuple of Expected
-        Total 95 % half widths that 90 % of random simulated drives kept to, with sensors of 1 %.
-    note : str
-        What limits it.
-    from_records : tuple of Expected
-        The same on drives without averages, whose means are made from records.
-    """
+    """A method of a quantity."""
 
     needs: tuple[str, ...] = ()
+    """Keys of :data:`FEATURES`."""
     expected: tuple[Expected, ...] = ()
+    """Total 95 % half widths that 90 % of random simulated drives kept to, with sensors of 1 %."""
     note: str = ""
+    """What limits it."""
     from_records: tuple[Expected, ...] = ()
+    """The same on drives without averages, whose means are made from records."""
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One way to one quantity.
-
-    Attributes
-    ----------
-    quantity, method : str
-        What and how.
-    missing : tuple of str
-        What the drive lacks, in words; empty: available.
-    expected : tuple of Expected
-        What to expect; empty: not measured.
-    note : str
-        What limits it.
-    """
+    """One way to one quantity."""
 
     quantity: str
     method: Method
+    """What and how."""
     missing: tuple[str, ...]
+    """What the drive lacks, in words; empty: available."""
     expected: tuple[Expected, ...] = ()
+    """What to expect; empty: not measured."""
     note: str = ""
+    """What limits it."""
 
     @property
     def available(self) -> bool:
@@ -201,33 +176,22 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What one drive gives.
-
-    Attributes
-    ----------
-    identity : Identity
-        Of the drive.
-    drive_map : DriveMap
-        The map used, less the rows that this drive lacks.
-    map_is_drives : bool
-        Whether that map names this identity; without, nothing is written through it.
-    features : frozenset of str
-        Keys of :data:`FEATURES` it has.
-    recorder : str
-        What a maker's recorder takes, or why it is not read; empty where the map names none.
-    replaced : tuple of str
-        Limits that the drive does not keep by itself, and what replaces them.
-    current_undecided : bool
-        Whether no source says if its amperes are peak or rms.
-    """
+    """What one drive gives."""
 
     identity: Identity
+    """Of the drive."""
     drive_map: DriveMap
+    """The map used, less the rows that this drive lacks."""
     map_is_drives: bool
+    """Whether that map names this identity; without, nothing is written through it."""
     features: frozenset[str]
+    """Keys of :data:`FEATURES` it has."""
     recorder: str = ""
+    """What a maker's recorder takes, or why it is not read; empty where the map names none."""
     replaced: tuple[str, ...] = ()
+    """Limits that the drive does not keep by itself, and what replaces them."""
     current_undecided: bool = False
+    """Whether no source says if its amperes are peak or rms."""
 
     @property
     def level(self) -> CapabilityLevel:

@@ -105,30 +105,21 @@ def stored_gains(J_kgm2: float) -> PositionGains:
 
 @dataclass(slots=True)
 class Behind:
-    """The machine and the application that the objects show and command.
-
-    Attributes
-    ----------
-    dictionary, plant, power
-        Of the session.
-    set_up : SetUp
-        The motor.
-    velocity_ff, acceleration_ff_s : float
-        Share of a move's speed that a cascade adds to its speed reference, and how many seconds of its acceleration.
-    position_gains : PositionGains
-        Of the position modes.
-    largest_step : float
-        Largest change of a torque command while energised in a cyclic mode, share of the rated torque; for tests.
-    """
+    """The machine and the application that the objects show and command."""
 
     dictionary: Dictionary
     plant: Plant
     power: PowerDrive
+    """Of the session."""
     set_up: SetUp
+    """The motor."""
     largest_step: float = 0.0
+    """Largest change of a torque command while energised in a cyclic mode, share of the rated torque; for tests."""
     velocity_ff: float = 0.0
     acceleration_ff_s: float = 0.0
+    """Share of a move's speed that a cascade adds to its speed reference, and how many seconds of its acceleration."""
     position_gains: PositionGains = field(init=False)
+    """Of the position modes."""
     _turns_off: int = field(default=0, init=False)
     _before_record: float | None = field(default=None, init=False)
     _torque_nm: float = field(default=0.0, init=False)
