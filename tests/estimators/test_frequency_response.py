@@ -10,9 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.shaft.frequency_response import COHERENT, FrequencyResponse, estimate_frequency_response
+from pmsmtool.estimators.shaft.response_lines import counted
 from pmsmtool.experiments.frequency_response import ROWS, WALK_SHARE, linear_level, plan_frequency_response
 from pmsmtool.trace import Trace
 
@@ -54,7 +56,7 @@ class Shaft:
 def record(shaft: Shaft | float, rng: np.random.Generator, level_a: float = 1.0, bits: int = 17) -> Trace:
     """A record of a shaft (or of a rigid inertia) that a filtered binary sequence moves."""
     from scipy.linalg import expm
-    from scipy.signal import lfilter, ss2tf
+    from scipy.signal import ss2tf
 
     lead = 4000
     count = lead + ROWS * DECIMATION
@@ -252,6 +254,22 @@ def test_a_vibration_that_no_torque_made_is_no_resonance(amplitude: float, frequ
     traces = [shaken(t, amplitude, frequency_hz, 1.7 * k) for k, t in enumerate(records(1.5e-3, 6))]
     found = estimate(traces)
     assert found.found == {} and found.information_gain < 0.0
+
+
+def test_steps_of_a_coarse_encoder_that_move_the_current_are_no_resonance() -> None:
+    """10 bits and 14 pole pairs, 4445 steps a second in rows of 4 kHz: a load of 106 motors. Here 4240, and 41."""
+    step, traces = 2.0 * math.pi / 2**10, []
+    for k, run in enumerate(records(0.5, 6, bits=30)):
+        theta = run["theta_M_rad"] + (6.0 + 0.02 * k) * run.t_s  # 26 rad/s
+        shown = step * np.floor(theta / step)
+        driven = 200.0 * lfilter([0.3], [1.0, -0.7], shown - theta)  # by what the frame errs, behind the current loop
+        traces.append(replace(run, signals={**run.signals, "theta_M_rad": shown, "i_q_a": run["i_q_a"] + driven}))
+    found = estimate(traces)
+    assert not found.found and found.suspected_hz == () and found.information_gain < 0.0  # 79, and found, before
+    assert found.inertia is not None and found.inertia.value == pytest.approx(0.5, rel=0.03)  # 0.44 before
+    frequency_hz = np.array([200.0, 242.0, 290.0, 484.0, 550.0, 726.0])
+    assert counted(traces, 2.0 * math.pi * frequency_hz).tolist() == [False, True, False, True, False, True]
+    assert not np.any(counted(records(2e-3, 1), 2.0 * math.pi * frequency_hz)), "steps of 17 bits are a noise"
 
 
 def test_a_resonance_outside_the_band_is_not_claimed_and_the_bound_is_told() -> None:

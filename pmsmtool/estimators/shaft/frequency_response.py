@@ -34,7 +34,14 @@ from pmsmtool.estimators.estimate import (
     scaled_covariance,
 )
 from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt
-from pmsmtool.estimators.shaft.response_lines import HALF_WIDTH, STAGE, local_polynomials, transforms, without_noise
+from pmsmtool.estimators.shaft.response_lines import (
+    HALF_WIDTH,
+    STAGE,
+    counted,
+    local_polynomials,
+    transforms,
+    without_noise,
+)
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.two_masses import CERTAIN_ZETA
 from pmsmtool.refusals import refuse
@@ -178,6 +185,10 @@ def estimate_frequency_response(
     unsure = angle_std * np.sqrt(np.mean(np.abs(cogging[:, : U.shape[1]]) ** 2, axis=0))
     scale = (scale_std, tolerance or SensorTolerance())
     result, lines, rigid = _judged(omega, U, Y, T, unsure, scale)
+    if result.information_gain > INFORMATION_GAIN and np.any(blind := counted(runs, omega)):
+        beside, _, _ = _judged(omega, U, Y, T, np.where(blind, math.inf, unsure), scale)
+        if beside.information_gain <= INFORMATION_GAIN:
+            return beside
     if result.information_gain > INFORMATION_GAIN and not result.found:
         ripple = _ripple(lines, rigid, runs, direction, U.shape[1])
         if ripple is not None:
@@ -232,6 +243,7 @@ def _rigid_shaft(
     G, sigma, std, coherence = local_polynomials(U, Y)
     inner = slice(HALF_WIDTH, len(omega) - HALF_WIDTH)
     sigma = np.hypot(sigma, unsure[inner] * np.abs(G))  # what all records share is not in their noise
+    std, coherence = (np.where(np.isinf(sigma), worst, x) for x, worst in ((std, math.inf), (coherence, 0.0)))
     lines = _Lines(omega[inner], np.exp(-1j * omega[inner] * T), T, U[:, inner], Y[:, inner], sigma)
     coherent = coherence >= COHERENT
     if (count := int(np.sum(coherent))) < COHERENT_LEAST:
