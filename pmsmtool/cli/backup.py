@@ -11,6 +11,7 @@ import click
 from pmsmtool.cli.drive_access import OWN_FAMILY, WHOLE_SET_S, map_of_drive, map_option, new_file, open_node
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import ConfigError
 
 if TYPE_CHECKING:
     from pmsmtool.flash.whole_drive import Listed
@@ -39,7 +40,6 @@ def backup_command(bus: BusOptions, out: Output, path: Path, map_file: Path | No
     points, outputs, node id and serial number. `pmsmtool restore FILE --other-drive` brings it to a spare part.
     """
     from pmsmtool.cli.flash_session import checked_identity
-    from pmsmtool.errors import ConfigError
     from pmsmtool.flash.journal import write_snapshot
     from pmsmtool.flash.restore import old_marks, take_backup
     from pmsmtool.flash.whole_drive import other_product, require_read, take_whole_backup

@@ -12,6 +12,7 @@ import click
 from pmsmtool.cli.drive_access import LOOKING_S, map_option, open_node, read_map, rehearsal_bus
 from pmsmtool.cli.options import FILE, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import PmsmtoolError
 from pmsmtool.plain_text import by_reason
 
 if TYPE_CHECKING:
@@ -101,7 +102,6 @@ def refused_of_design(
     if machine is None or not found.map_is_drives or found.drive_map.staging:
         return {}
     from pmsmtool.commissioning.axis_design import refused_by_limits
-    from pmsmtool.errors import PmsmtoolError
     from pmsmtool.machine.machine_file import load_machine_file
 
     try:

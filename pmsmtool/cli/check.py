@@ -12,6 +12,7 @@ import click
 from pmsmtool.cli.drive_access import LOOKING_S, claimed_node, map_option, open_node, read_map
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import CheckFailed, ConfigError, NotAvailable, Partial
 
 if TYPE_CHECKING:
     from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -80,7 +81,6 @@ OF_THE_DRIVE = "what is stated is what the drive holds: name the connected motor
 
 def _conclude(out: Output, found: list[Finding], stated_by: str = "") -> None:
     """Print the table; raises where something is wrong, or what matters was not seen."""
-    from pmsmtool.errors import CheckFailed, Partial
     from pmsmtool.identification.wiring import NOT_CHECKED, NOT_SEEN, WRONG
 
     out.result(
@@ -118,7 +118,6 @@ def _check_below_full(
     from pmsmtool.cia402 import HOMING_LOST
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.commissioning.first_check_levels import check_below_full, envelope_below_full, turns_a_vector
-    from pmsmtool.errors import ConfigError, NotAvailable
     from pmsmtool.identification.request import IdentifyRequest, Method
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.measurement.capabilities import CapabilityLevel

@@ -28,6 +28,8 @@ from pmsmtool.cli.options import (
 )
 from pmsmtool.cli.output import Output
 from pmsmtool.cli.progress import StageProgress
+from pmsmtool.errors import ConfigError, Contradiction, Declined, ExitCode, IdentificationError, NotAvailable
+from pmsmtool.files import read_text
 
 if TYPE_CHECKING:
     from pmsmtool.drive.canopen_drive import CanopenDrive
@@ -125,7 +127,6 @@ def commission_command(
     from pmsmtool.cli.consent import refuse_unattended
     from pmsmtool.commissioning.commission import Commissioning
     from pmsmtool.commissioning.compared_stage import check_accepted
-    from pmsmtool.errors import ConfigError, NotAvailable
     from pmsmtool.flash.journal import JournalFolder
     from pmsmtool.flash.map_gate import forget_map
     from pmsmtool.machine.machine_file import load_machine_file
@@ -218,7 +219,6 @@ def _kept_nameplate(run: RunDirectory) -> Path | None:
 
 def _limits_as_begun(motion: MotionOptions, run: RunDirectory) -> MotionOptions:
     """Fill in the motion limits of a run where the command line names none; they bound its proof, too."""
-    from pmsmtool.files import read_text
     from pmsmtool.identification.request import REQUEST, parse_request
 
     path = run.path / REQUEST
@@ -332,7 +332,6 @@ class _Person:
 def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
     """Write the report whatever ends the chain; a run that was declined before anything was measured is removed."""
     from pmsmtool.commissioning.commission import has_measured, write_report
-    from pmsmtool.errors import Declined
 
     begun = time.monotonic()
     try:
@@ -351,7 +350,6 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
     out.status("writing the report ...")
     write_report(run)
     found = _show(run, out, begun)
-    from pmsmtool.errors import ExitCode
 
     if found.kind == "partial":  # the verdict is the last line: nothing is said after it
         raise click.exceptions.Exit(int(ExitCode.PARTIAL))
@@ -359,8 +357,6 @@ def _reported(run: RunDirectory, out: Output, *, fresh: bool) -> Iterator[None]:
 
 def _next_step(run: RunDirectory, error: BaseException) -> str:
     """Say what leads on: a run whose machine was not identified, or that this drive cannot do, begins anew."""
-    from pmsmtool.errors import Contradiction, IdentificationError, NotAvailable
-
     if isinstance(error, NotAvailable | IdentificationError | Contradiction):
         return "to go on, remove the cause and begin a new run: this one would end the same way"
     return f"go on with: pmsmtool commission --resume {run.path}"

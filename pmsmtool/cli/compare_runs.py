@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import click
 
 from pmsmtool.cli.options import ANY_PATH, FILE, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, figure_format, save_figure, table
+from pmsmtool.errors import CheckFailed, ConfigError
 
 
 @click.command(
@@ -36,7 +38,6 @@ def diff_command(
     code with --check is then 1 where the second one follows worse.
     """
     from pmsmtool.commissioning.report_page import verdict
-    from pmsmtool.errors import CheckFailed, ConfigError
     from pmsmtool.identification import compared_runs as compared
     from pmsmtool.identification.request import read_run
 
@@ -107,7 +108,6 @@ def _moved(first: Path, second: Path) -> bool:
 def _diff_of_moves(first: Path, second: Path, check: bool, out: Output) -> None:
     from pmsmtool.axis.move import compared_moves, demanded, move_result, same_move, shown
     from pmsmtool.commissioning.move import TRACE
-    from pmsmtool.errors import CheckFailed, ConfigError
     from pmsmtool.run_directory import RunDirectory
     from pmsmtool.trace import read_trace
 
@@ -133,6 +133,4 @@ def _diff_of_moves(first: Path, second: Path, check: bool, out: Output) -> None:
 
 
 def _facts(row: object) -> dict[str, object]:
-    from dataclasses import asdict
-
     return asdict(row)  # type: ignore[call-overload,no-any-return]

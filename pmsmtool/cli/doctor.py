@@ -9,6 +9,7 @@ import click
 
 from pmsmtool.cli.options import TIME, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import BusError
 
 if TYPE_CHECKING:
     from pmsmtool.bus.examination import Adapter, Examination
@@ -37,7 +38,6 @@ def doctor_command(bus: BusOptions, out: Output, find_bitrate: bool, listen_s: f
     no node answers on it. Ends within 60 s and the time of listening.
     """
     from pmsmtool.bus.connect import in_time
-    from pmsmtool.errors import BusError
 
     rounds = 9.0 if find_bitrate else 1.0
     limit_s = WITHIN_S + rounds * listen_s

@@ -16,7 +16,7 @@ import click
 
 from pmsmtool.cli.options import DIR, FILE, SIMULATED_INTERFACE, BusOptions
 from pmsmtool.cli.output import Output
-from pmsmtool.errors import BusError, ConfigError
+from pmsmtool.errors import BusError, ConfigError, NotAvailable, SdoAbort
 from pmsmtool.files import read_bytes, read_text, refuse_existing
 from pmsmtool.plain_text import counted
 
@@ -148,7 +148,6 @@ def open_node(
 def _vendor_product(node: DriveNode) -> tuple[int, int] | None:
     """Return vendor and product (0x1018), None where the drive shows none."""
     from pmsmtool.drive import objects
-    from pmsmtool.errors import SdoAbort
 
     try:
         vendor, product = (int.from_bytes(node.sdo.read(objects.IDENTITY, sub, size=4), "little") for sub in (1, 2))
@@ -181,7 +180,6 @@ def open_drive(bus: BusOptions, drive_map: DriveMap | None = None) -> Iterator[C
     reference drive's objects.
     """
     from pmsmtool.drive.canopen_drive import CanopenDrive
-    from pmsmtool.errors import NotAvailable, SdoAbort
     from pmsmtool.flash.map_gate import check_motion
 
     with bus.connect() as connection:

@@ -14,7 +14,7 @@ import click
 from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import ANY_PATH, DIR, FILE, NODE, examples, text_options
 from pmsmtool.cli.output import Output
-from pmsmtool.files import read_bytes, refuse_source, write_file
+from pmsmtool.files import make_folder, read_bytes, refuse_source, write_file
 
 if TYPE_CHECKING:
     from pmsmtool.drive_maps.drive_map import DriveMap
@@ -182,7 +182,6 @@ def c_command(design: Path, prefix: str, folder: Path, fixed_point: bool, all_la
     """
     from pmsmtool.commissioning.export import image_of
     from pmsmtool.commissioning.parameter_source import load_parameters
-    from pmsmtool.files import make_folder
     from pmsmtool.firmware.export_c import c_files, not_read
     from pmsmtool.firmware.export_readme import period_share
 

@@ -11,6 +11,7 @@ import click
 from pmsmtool.cli.drive_access import LOOKING_S, open_node
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import SdoAbort
 
 if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
@@ -49,7 +50,6 @@ def reset_command(bus: BusOptions, out: Output) -> None:
 def _faults(node: DriveNode) -> dict[str, Any]:
     from pmsmtool.cia402 import error_text
     from pmsmtool.drive import objects
-    from pmsmtool.errors import SdoAbort
 
     history = []
     with contextlib.suppress(SdoAbort):

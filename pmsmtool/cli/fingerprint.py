@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pmsmtool.cli.output import table
+from pmsmtool.errors import CheckFailed, ConfigError, Partial
 
 if TYPE_CHECKING:
     from pmsmtool.identification.compared_runs import Difference
@@ -49,8 +50,6 @@ class Comparison:
 
     def require_same(self, run: RunDirectory) -> None:
         """Raise ``CheckFailed`` where a value differs."""
-        from pmsmtool.errors import CheckFailed
-
         changed = [row.name for row in self.rows if row.verdict == "differs"]
         if changed:
             raise CheckFailed(
@@ -60,8 +59,6 @@ class Comparison:
 
     def require_whole(self, run: RunDirectory) -> None:
         """Raise ``Partial`` where a value could not be compared."""
-        from pmsmtool.errors import Partial
-
         if self.left:
             raise Partial(
                 f"{len(self.left)} of the values could not be compared with {self.earlier.run}", where=str(run.path),
@@ -75,7 +72,6 @@ def earlier_run(path: Path, quantities: Sequence[str], method: str) -> tuple[Ear
 
     Raises ConfigError: it cannot be compared with: damaged, without these values, or of another level than ``method``.
     """
-    from pmsmtool.errors import ConfigError
     from pmsmtool.identification.fingerprint import QUANTITIES, read_earlier
     from pmsmtool.run_directory import RunDirectory
 

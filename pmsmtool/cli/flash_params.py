@@ -25,6 +25,7 @@ from pmsmtool.cli.options import (
     write_options,
 )
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import CheckFailed, ConfigError, Declined, PmsmtoolError
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -76,7 +77,6 @@ def flash_fleet(
     from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
-    from pmsmtool.errors import CheckFailed, PmsmtoolError
     from pmsmtool.flash.download import Download, run_all, set_named
     from pmsmtool.flash.journal import JournalFolder
     from pmsmtool.flash.map_gate import check_nodes
@@ -145,7 +145,6 @@ class _Unattended:
 
     def __init__(self, serials: Path, canary: Path | None, wanted: ParameterSet, drive_map: DriveMap) -> None:
         from pmsmtool.commissioning.parameter_source import load_parameters
-        from pmsmtool.errors import ConfigError
         from pmsmtool.flash.unattended import check_canary, read_serials
         from pmsmtool.run_directory import RunDirectory
 
@@ -163,7 +162,6 @@ class _Unattended:
         self, jobs: list[Download], due: list[Download], motion: MotionOptions, out: Output, lines: list[str]
     ) -> None:
         """Refuse what no person allowed; show the lists of differences."""
-        from pmsmtool.errors import Declined
         from pmsmtool.flash.unattended import STILL_S, check_drives, wait_still
 
         for line in lines:
@@ -180,7 +178,6 @@ def _ask(
     lines: list[str], due: list[Download], bus: BusOptions, motion: MotionOptions, out: Output, *, store: bool | None
 ) -> None:
     from pmsmtool.cli.consent import ask_writing, person_present
-    from pmsmtool.errors import Declined
 
     if motion.yes and not bus.simulated() and not person_present():
         raise Declined(
@@ -194,8 +191,6 @@ def _ask(
 
 
 def _refuse_serial(motion: MotionOptions) -> None:
-    from pmsmtool.errors import ConfigError
-
     if motion.serial is not None:
         raise ConfigError(
             "--serial names one drive", where="--nodes",

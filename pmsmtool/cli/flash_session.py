@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from pmsmtool.cli.options import BusOptions, MotionOptions
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import CheckFailed
 from pmsmtool.plain_text import counted
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ def carry_out(
     check: bool = False,
 ) -> None:
     """Plan, ask, write, print; the download is put into ``jobs`` (``flash.download.set_named``)."""
-    from pmsmtool.errors import CheckFailed
     from pmsmtool.flash.restore import plan_download, tell_lacking
 
     if dry_run or check:

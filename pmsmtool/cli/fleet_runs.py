@@ -11,6 +11,7 @@ import click
 
 from pmsmtool.cli.options import DIR, FILE, examples, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import ConfigError, PmsmtoolError
 from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
@@ -47,7 +48,6 @@ def fleet_command(folder: Path, path: Path | None, out: Output) -> None:
     left out: it is the same in every run.
     """
     from pmsmtool.commissioning.fleet_page import HEADS, cells, fleet_page
-    from pmsmtool.errors import ConfigError
 
     if path is not None and path.suffix.lower() not in (".html", ".csv"):
         raise ConfigError("a page or a table is written", where=str(path), hint="name a .html or a .csv file")
@@ -71,7 +71,6 @@ def fleet_command(folder: Path, path: Path | None, out: Output) -> None:
 
 def _runs(folder: Path) -> tuple[dict[str, list[Run]], list[str]]:
     """Return the runs by their motor, in order of time, and those that hold no values."""
-    from pmsmtool.errors import ConfigError, PmsmtoolError
     from pmsmtool.identification.compared_runs import measured
     from pmsmtool.identification.request import read_run
 

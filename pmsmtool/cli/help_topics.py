@@ -13,7 +13,9 @@ from pmsmtool.cli.command_table import COMMANDS
 from pmsmtool.cli.options import examples
 from pmsmtool.cli.output import table, terminal_width
 from pmsmtool.errors import ExitCode
+from pmsmtool.files import user_folder
 from pmsmtool.plain_text import folded
+from pmsmtool.units import UNITS
 
 if TYPE_CHECKING:
     from pmsmtool.machine.key import Key
@@ -86,8 +88,6 @@ Order: after the command, before the command, PMSMTOOL_*, python-can's configura
 
 
 def _units() -> str:
-    from pmsmtool.units import UNITS
-
     rows = [(unit.symbol, unit.dimension, ", ".join(unit.spellings)) for unit in UNITS.values()]
     return "\n".join(
         [
@@ -186,8 +186,6 @@ def _scenario() -> str:
 
 
 def _environment() -> str:
-    from pmsmtool.files import user_folder
-
     return ENVIRONMENT.format(home=user_folder())
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,10 @@ import click
 
 from pmsmtool.cli.drive_access import map_option, runs_option
 from pmsmtool.cli.options import DIR, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
-from pmsmtool.cli.output import Output
+from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import Declined, IdentificationError, NotAvailable, Partial
+from pmsmtool.plain_text import by_reason
+from pmsmtool.units import format_estimate, format_quantity
 
 if TYPE_CHECKING:
     from pmsmtool.bus.connection import Connection
@@ -116,7 +119,6 @@ def identify_command(
     tolerances of that run are used where none are given. Each value is SAME or DIFFERENT, with the likely cause.
     """  # noqa: D301 - click reads the control character
     from pmsmtool.cli.fingerprint import compare, earlier_run, like_then
-    from pmsmtool.errors import NotAvailable
     from pmsmtool.estimators.estimate import SensorTolerance
     from pmsmtool.identification.calibration import calibrated_tolerance
     from pmsmtool.identification.request import NEEDS, QUANTITIES, IdentifyRequest, Method
@@ -217,7 +219,6 @@ def supply_reader(connection: Connection, node: int, *, simulated: bool) -> Read
         The drive is simulated in this process, and its supply with it.
     """
     from pmsmtool.cli.consent import person_present
-    from pmsmtool.errors import Declined
 
     def ask(i_a: float) -> tuple[float, float]:
         click.echo(f"{i_a:.4g} Apk in the machine: what does the bench supply show?", err=True)
@@ -274,7 +275,6 @@ def _measure(
 @contextmanager
 def _accounted(run: RunDirectory, out: Output) -> Iterator[Callable[[str], None]]:
     """Have the run say how it ended, whatever ends it; one that was declined before anything moved leaves no trace."""
-    from pmsmtool.errors import Declined
     from pmsmtool.measurement.run_account import accounted
 
     try:
@@ -289,15 +289,10 @@ def _accounted(run: RunDirectory, out: Output) -> Iterator[Callable[[str], None]
 
 
 def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison | None = None) -> None:
-    from dataclasses import asdict
 
-    from pmsmtool.cli.output import table
-    from pmsmtool.errors import IdentificationError, Partial
     from pmsmtool.identification.request import accuracy_line, accuracy_told
-    from pmsmtool.plain_text import by_reason
     from pmsmtool.report.report import total_interval
     from pmsmtool.report.verdict import on_which_drive
-    from pmsmtool.units import format_estimate, format_quantity
 
     rows = []
     for value in stage.values:

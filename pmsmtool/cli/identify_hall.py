@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pmsmtool.cli.drive_access import new_run, open_drive
+from pmsmtool.cli.options import BusOptions, MotionOptions
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import NotAvailable
+from pmsmtool.units import rad_s_from_rpm
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from pmsmtool.cli.options import BusOptions, MotionOptions
     from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.identification.hall import HallAlignment
 
@@ -34,12 +36,10 @@ def identify_hall(bus: BusOptions, motion: MotionOptions, out: Output, runs: Pat
     from pmsmtool.drive import objects
     from pmsmtool.drive.envelope import Envelope
     from pmsmtool.drive.guard import guarded
-    from pmsmtool.errors import NotAvailable
     from pmsmtool.experiments.rotation import WAY_RAD, turn_over_halls
     from pmsmtool.identification.hall import hall_alignment
     from pmsmtool.run_directory import Stage
     from pmsmtool.trace import trace_npz
-    from pmsmtool.units import rad_s_from_rpm
 
     with open_drive(bus, drive_map) as drive:
         shown = objects.LIVE["hall_pattern"]

@@ -12,6 +12,7 @@ import click
 from pmsmtool.cli.drive_access import LOOKING_S, open_node
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import SdoAbort
 
 if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
@@ -90,8 +91,6 @@ def _limits(node: DriveNode) -> dict[str, float | None]:
 
 
 def _whole(node: DriveNode, item: Any) -> int | None:
-    from pmsmtool.errors import SdoAbort
-
     with contextlib.suppress(SdoAbort):
         return node.whole(item)
     return None

@@ -23,6 +23,7 @@ from pmsmtool.cli.options import (
     output_options,
 )
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import ConfigError, Partial, SafetyRefusal
 from pmsmtool.units import rpm_from_rad_s
 
 SPEED_MARGIN = 1.5
@@ -65,7 +66,6 @@ def jog_command(
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.drive.envelope import Envelope
     from pmsmtool.drive.guard import guarded
-    from pmsmtool.errors import ConfigError
 
     if (current_apk is None) == (speed_rad_s is None):
         raise ConfigError(
@@ -103,8 +103,6 @@ def jog_command(
 
 
 def _require_reached(asked: float, means: list[tuple[str, float, str]], pole_pairs: float) -> None:
-    from pmsmtool.errors import Partial
-
     speed = next(value for name, value, _ in means if name == "omega_e_rad_s") / pole_pairs
     if abs(speed - asked) > abs(asked) / 2:
         raise Partial(
@@ -116,8 +114,6 @@ def _require_reached(asked: float, means: list[tuple[str, float, str]], pole_pai
 
 def _refuse_beyond(quantity: str, value: float, limit: float, unit: str, name: str) -> None:
     """Refuse what the drive would cut without a word: its own limit of the machine, where it knows one."""
-    from pmsmtool.errors import SafetyRefusal
-
     if 0.0 < limit < value:
         raise SafetyRefusal(
             f"a {quantity} of {value:.4g} {unit} is asked for, the machine's largest is {limit:.4g} {unit}",

@@ -9,6 +9,7 @@ import click
 
 from pmsmtool.cli.options import NODE, BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import BusError, ConfigError
 
 if TYPE_CHECKING:
     from pmsmtool.bus.lss import LssAddress
@@ -50,7 +51,6 @@ def set_command(bus: BusOptions, motion: MotionOptions, out: Output, new_id: int
     from pmsmtool.bus.nmt import find_nodes
     from pmsmtool.cli.consent import ask_writing
     from pmsmtool.drive.drive_lock import claim_identity, claim_layer_setting
-    from pmsmtool.errors import BusError, ConfigError
 
     with bus.connect() as connection:
         claim_layer_setting(connection)

@@ -11,6 +11,7 @@ import click
 from pmsmtool.cli.drive_access import new_file
 from pmsmtool.cli.options import FILE, FREQUENCY, TIME, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import CheckFailed, ConfigError
 from pmsmtool.files import refuse_source, write_file
 
 
@@ -21,7 +22,6 @@ class _LineCurrent(click.ParamType[float]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return A peak; click's error names the option."""
-        from pmsmtool.errors import ConfigError
         from pmsmtool.machine.datasheet import line_current
 
         try:
@@ -131,7 +131,6 @@ def new_command(path: Path, out: Output, **given: Any) -> None:
 
 def _sheet(given: dict[str, Any]) -> tuple[Any, str]:
     """The datasheet of the command's options, and which ampere was recognised."""
-    from pmsmtool.errors import ConfigError
     from pmsmtool.machine.datasheet import Datasheet, parse_emf_constant, parse_torque_constant, torque_constant_by_emf
 
     both, axes = given.pop("L_h"), (given["L_d_h"], given["L_q_h"])
@@ -175,7 +174,6 @@ def map_command(
     Repairs happen only on request, in the order fill, rotate, symmetrise, reciprocal, and each says what it changed.
     Exit code 1 when a number is outside its limit.
     """
-    from pmsmtool.errors import CheckFailed, ConfigError
     from pmsmtool.machine import flux_map_repair
     from pmsmtool.machine.flux_map_check import check_flux_map
     from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz, load_flux_map

@@ -35,6 +35,7 @@ from pmsmtool.errors import (
     decisive,
     related,
 )
+from pmsmtool.files import user_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -164,7 +165,6 @@ def _keep(text: str) -> Path | None:
     from pathlib import Path
 
     from pmsmtool import __version__
-    from pmsmtool.files import user_folder
 
     head = f"pmsmtool {__version__}, Python {platform.python_version()}, {platform.platform()}\n{' '.join(sys.argv)}\n"
     stamp = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S%fZ")

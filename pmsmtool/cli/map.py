@@ -15,10 +15,11 @@ import click
 from pmsmtool.cli.drive_access import claimed_node, map_of_drive, map_option, new_file
 from pmsmtool.cli.options import FILE, BusOptions, MotionOptions, bus_options, examples, motion_options, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import CheckFailed, ConfigError, IdentificationError, LimitExceeded, Partial
+from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
     from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
-    from pmsmtool.errors import LimitExceeded
     from pmsmtool.identification.learned_gains import Learned
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.measurement.changed_gains import GainObject
@@ -70,7 +71,6 @@ def learn_command(
     from pmsmtool.cli.consent import ask_motion
     from pmsmtool.drive.motion_objects import unlike_stated
     from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
-    from pmsmtool.errors import ConfigError
     from pmsmtool.flash.map_gate import check_motion
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, gain_address, gain_object, refuse_unsafe
@@ -126,7 +126,6 @@ def learn_command(
 
 def _addresses(names: tuple[str, ...]) -> dict[str, tuple[int, int] | None]:
     """Return the wanted names with their objects, None where none is given."""
-    from pmsmtool.errors import ConfigError
     from pmsmtool.measurement.changed_gains import STANDARD
     from pmsmtool.measurement.learn_current_gains import CURRENT_GAIN, CURRENT_INTEGRAL
     from pmsmtool.measurement.learn_position_gain import POSITION
@@ -157,8 +156,6 @@ def _tell(
 ) -> None:
     """Print what was learned, write the map, and end as it deserves: first of all with a limit that stopped a move."""
     from pmsmtool.drive_maps.drive_map_file import dump_drive_map
-    from pmsmtool.errors import CheckFailed, IdentificationError, Partial
-    from pmsmtool.files import write_file
     from pmsmtool.measurement.learned_rows import map_with, measured_row, shown_currents
 
     currents = shown_currents(file, measured, drive)

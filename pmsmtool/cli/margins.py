@@ -16,7 +16,7 @@ import click
 
 from pmsmtool.cli.options import ANY_PATH, FILE, Quantity, examples, output_options
 from pmsmtool.cli.output import Output, figure_format, inside, save_figure, table
-from pmsmtool.errors import BusError, NotAvailable
+from pmsmtool.errors import BusError, CheckFailed, NotAvailable
 
 if TYPE_CHECKING:
     from pmsmtool.design.design_file import Design
@@ -90,7 +90,6 @@ def margins_command(
     from pmsmtool.design.design_file import load_design
     from pmsmtool.design.loops.margins import MarginRequest, margin_report
     from pmsmtool.design.tolerance import tolerance_box
-    from pmsmtool.errors import CheckFailed, NotAvailable
 
     if plot_path is not None:
         figure_format(plot_path)

@@ -13,6 +13,8 @@ import click
 from pmsmtool.cli.drive_access import LOOKING_S, map_option, open_node, read_map, warn_of_other_drive
 from pmsmtool.cli.options import FILE, FREQUENCY, TIME, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import ConfigError
+from pmsmtool.files import read_bytes
 from pmsmtool.plain_text import counted
 
 if TYPE_CHECKING:
@@ -63,7 +65,6 @@ def monitor_command(
     """
     from pmsmtool.drive.logged_values import Column, available, readings, sent
     from pmsmtool.drive.objects import signal_unit
-    from pmsmtool.errors import ConfigError
 
     try:
         wanted = re.compile(pattern or "")
@@ -119,8 +120,6 @@ def _show_log(
     from pmsmtool.bus.bus_log import BusLog
     from pmsmtool.drive.logged_values import Column, logged_values, quantities
     from pmsmtool.drive_maps.eds import parse_eds
-    from pmsmtool.errors import ConfigError
-    from pmsmtool.files import read_bytes
 
     sheet = None if eds is None else parse_eds(read_bytes(eds), str(eds), node)
     named = quantities(read_map(map_file), sheet)

@@ -35,6 +35,8 @@ from pmsmtool.cli.options import (
     output_options,
 )
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import ConfigError, LimitExceeded
+from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
     from pmsmtool.cli.consent import Consent
@@ -96,7 +98,6 @@ def move_command(
     from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.design.design_file import load_design
     from pmsmtool.drive.envelope import Envelope
-    from pmsmtool.errors import ConfigError, LimitExceeded
     from pmsmtool.flash.download import set_named
     from pmsmtool.flash.restore import tell_lacking
     from pmsmtool.machine.machine_file import load_machine_file
@@ -163,7 +164,6 @@ class _Moves:
         from pmsmtool.cli.consent import ask_motion, keep
         from pmsmtool.commissioning.move import make_move, moved_machine
         from pmsmtool.drive.position_drive import PositionDrive
-        from pmsmtool.files import write_file
         from pmsmtool.flash.map_gate import check_motion
         from pmsmtool.machine.machine_file import dump_machine_file
 

@@ -8,6 +8,7 @@ import click
 from pmsmtool.cli.drive_access import choose_node
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import DriveTimeout, SdoAbort
 
 COMMANDS = ("start", "stop", "pre-operational", "reset-node", "reset-communication")
 
@@ -23,7 +24,6 @@ def nmt_command(bus: BusOptions, out: Output, command: str) -> None:
     from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.drive_maps.shipped_maps import GENERIC, load_family
-    from pmsmtool.errors import DriveTimeout, SdoAbort
     from pmsmtool.flash.download import refuse_while_enabled
 
     wanted = NmtCommand[command.replace("-", "_").upper()]

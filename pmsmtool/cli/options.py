@@ -23,6 +23,7 @@ from click.core import ParameterSource
 
 from pmsmtool.cli.output import Output, set_up_logging
 from pmsmtool.errors import ConfigError
+from pmsmtool.units import parse_quantity
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -79,8 +80,6 @@ class Quantity(click.ParamType[float]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return the SI value (A peak for a current), or fail as a usage error."""
-        from pmsmtool.units import parse_quantity
-
         if isinstance(value, float):
             return value
         if self.bare:

@@ -26,12 +26,14 @@ from pmsmtool.cli.drive_access import (
 )
 from pmsmtool.cli.options import BusOptions, MotionOptions, bus_options, examples, output_options, write_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import BusError, CheckFailed, ConfigError, NotAvailable, PmsmtoolError, SdoAbort
+from pmsmtool.files import write_file
 from pmsmtool.plain_text import counted
+from pmsmtool.units import parse_quantity
 
 if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.drive_maps.drive_map import DriveMap
-    from pmsmtool.errors import PmsmtoolError
     from pmsmtool.params.parameter_set import Difference, ParameterSet
 
 _ADDRESS = re.compile(r"(0[xX][0-9a-fA-F]{1,4})(?::([0-9a-fA-F]{1,2}))?")
@@ -130,8 +132,6 @@ def set_command(
 @output_options
 def dump_command(bus: BusOptions, out: Output, everything: bool, path: Path | None, map_file: Path | None) -> None:
     """Print the drive's parameters as a parameter set that flash-params takes."""
-    from pmsmtool.files import write_file
-
     with open_node(bus, map_of_drive(bus, map_file), within_s=WHOLE_SET_S) as node:
         warn_of_other_drive(node, out)
         _say_staged(node, out)
@@ -160,7 +160,6 @@ def dump_command(bus: BusOptions, out: Output, everything: bool, path: Path | No
 @output_options
 def diff_command(bus: BusOptions, out: Output, old: str, new: str, check: bool, map_file: Path | None) -> None:
     """Compare any two of: device, default, a parameter set, a design, a DCF, a run directory."""
-    from pmsmtool.errors import CheckFailed
     from pmsmtool.params.parameter_set import compare
 
     drive_map = map_of_drive(bus, map_file) if "device" in (old, new) else read_map(map_file)
@@ -225,7 +224,6 @@ def _resolve(text: str, drive_map: DriveMap) -> list[_Entry]:
 
     Raises ConfigError: nothing has that name; NotAvailable: the map has no object for it.
     """
-    from pmsmtool.errors import ConfigError, NotAvailable
     from pmsmtool.params.catalogue import BY_NAME
 
     address = _ADDRESS.fullmatch(text)
@@ -257,8 +255,6 @@ def _near(text: str, names: Collection[str]) -> list[str]:
 
 
 def _assignment(text: str, drive_map: DriveMap) -> dict[str, float]:
-    from pmsmtool.errors import ConfigError
-
     name, equals, value = text.partition("=")
     if not equals:
         raise ConfigError(f"{text!r} is no NAME=VALUE", hint="write it like motor.R_s_ohm=0.1")
@@ -272,9 +268,7 @@ def _assignment(text: str, drive_map: DriveMap) -> dict[str, float]:
 
 def _number(text: str, name: str) -> float:
     """Return a value: plain in the unit of the name, hexadecimal, or with a unit of its own."""
-    from pmsmtool.errors import ConfigError
     from pmsmtool.params.catalogue import BY_NAME
-    from pmsmtool.units import parse_quantity
 
     try:
         return float(int(text, 16)) if text.lower().startswith("0x") else float(text)
@@ -290,8 +284,6 @@ def _number(text: str, name: str) -> float:
 
 def _read_all(node: DriveNode, wanted: list[_Entry]) -> tuple[list[dict[str, Any]], list[PmsmtoolError]]:
     """Return what each object holds, or why it could not be read, and these errors."""
-    from pmsmtool.errors import PmsmtoolError
-
     entries, failures = [], []
     for entry in wanted:
         try:
@@ -306,8 +298,6 @@ def _read_all(node: DriveNode, wanted: list[_Entry]) -> tuple[list[dict[str, Any
 
 def _badness(error: PmsmtoolError) -> int:
     """Order errors: what the drive does not have, what it refuses, what it does not answer."""
-    from pmsmtool.errors import BusError, NotAvailable
-
     return 2 if isinstance(error, BusError) else 0 if isinstance(error, NotAvailable) else 1
 
 
@@ -336,7 +326,6 @@ def _text(entry: dict[str, Any]) -> str:
 
 def _say_staged(node: DriveNode, out: Output) -> None:
     from pmsmtool.drive.parameters import DriveParameters
-    from pmsmtool.errors import SdoAbort
 
     try:
         if DriveParameters(node).is_staged():

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,8 @@ from pmsmtool.cli.options import (
     output_options,
     overspeed_option,
 )
-from pmsmtool.cli.output import Output
+from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import ConfigError, SafetyRefusal
 
 if TYPE_CHECKING:
     from pmsmtool.run_directory import RunDirectory, Stage
@@ -63,12 +65,9 @@ def prove_command(
     weakening, a move of the position loop with the speed fed forward and one without. Above the speed of uncontrolled
     generation they go only where a fault shorts the windings, or a brake chopper is stated.
     """
-    from dataclasses import replace
-
     from pmsmtool.cli.consent import ask_motion, keep
     from pmsmtool.commissioning.commission import write_report
     from pmsmtool.design.design_file import design_text, load_design
-    from pmsmtool.errors import ConfigError
     from pmsmtool.proof.stage import ProofRequest, not_proven, prove_stage
     from pmsmtool.run_directory import RunDirectory
 
@@ -108,8 +107,6 @@ def prove_command(
 
 
 def _same_drive(run: RunDirectory, serial: int) -> None:
-    from pmsmtool.errors import SafetyRefusal
-
     expected = run.read().drive.get("serial")
     if expected != serial:
         raise SafetyRefusal(
@@ -138,9 +135,7 @@ def _proven(run: RunDirectory, out: Output, prove: Callable[[Callable[[str], Non
 
 
 def _show(run: RunDirectory, stage: Stage, out: Output) -> None:
-    from dataclasses import asdict
 
-    from pmsmtool.cli.output import table
     from pmsmtool.report.verdict import is_simulated, on_which_drive
 
     facts = {str(value["name"]): value["value"] for value in stage.values if "where" not in value}

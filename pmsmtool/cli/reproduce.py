@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.options import ANY_PATH, FILE, WholeNumber, examples, output_options
-from pmsmtool.cli.output import Output, table
+from pmsmtool.cli.output import Output, figure_format, jsonable, save_figure, table
+from pmsmtool.errors import CheckFailed, ConfigError
+from pmsmtool.files import make_folder, write_file
 
 if TYPE_CHECKING:
     from pmsmtool.papers.figure import Reproduction
@@ -52,8 +54,6 @@ def reproduce_command(
         raise click.UsageError("missing argument FIGURE: a name of --list, or all")
     if figure == "all" and (figure_path is not None or (path is not None and path.suffix.lower() in _SUFFIXES)):
         raise click.UsageError("all figures need a folder: -o DIR")
-    from pmsmtool.cli.output import figure_format
-    from pmsmtool.errors import CheckFailed
     from pmsmtool.papers.registry import FIGURES, find, reproduce
 
     if figure_path is not None:
@@ -83,8 +83,6 @@ def reproduce_command(
 
 def _check_file(path: Path | None) -> None:
     """Refuse a file name that means neither a folder nor one of the formats, before anything is computed."""
-    from pmsmtool.errors import ConfigError
-
     if path is not None and not path.is_dir() and path.suffix and path.suffix.lower() not in _SUFFIXES:
         raise ConfigError(
             f"{path.name} has no format", where=str(path), hint="a folder, or .json, .csv, .txt; the plot is --plot"
@@ -142,8 +140,6 @@ def _text(row: Row, found: Reproduction) -> Iterator[str]:
 
 
 def _write(row: Row, found: Reproduction, path: Path | None, figure_path: Path | None, out: Output) -> None:
-    from pmsmtool.cli.output import save_figure
-    from pmsmtool.files import make_folder, write_file
     from pmsmtool.papers.figure import csv_text, figure_of
 
     targets: list[Path] = []
@@ -169,8 +165,6 @@ def _content(row: Row, found: Reproduction, suffix: str, csv_text: Any) -> str:
     if suffix == ".txt":
         return "\n".join((*_text(row, found), ""))
     import json
-
-    from pmsmtool.cli.output import jsonable
 
     content = {"schema": "pmsmtool.reproduce/1", **_data(row, found), "panels": _series(found)}
     return json.dumps(jsonable(content), allow_nan=False, indent=1) + "\n"

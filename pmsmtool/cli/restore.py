@@ -18,6 +18,7 @@ from pmsmtool.cli.options import (
     write_options,
 )
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import ConfigError, Partial
 
 
 @click.command(
@@ -55,7 +56,6 @@ def restore_command(
     from pmsmtool.cli.flash_session import checked_identity, told, write_plan
     from pmsmtool.drive.objects import STORE_ALL
     from pmsmtool.drive_maps.shipped_maps import family_of
-    from pmsmtool.errors import ConfigError, Partial
     from pmsmtool.flash.download import describe, set_named
     from pmsmtool.flash.journal import JournalFolder, read_snapshot
     from pmsmtool.flash.restore import check_snapshot, due_of_journal, nothing_written, old_marks, plan_restore

@@ -10,6 +10,7 @@ import click
 from pmsmtool.cli.drive_access import LOOKING_S
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import BusError, SdoAbort
 
 if TYPE_CHECKING:
     from pmsmtool.bus.connection import Connection
@@ -29,7 +30,6 @@ def scan_command(bus: BusOptions, out: Output) -> None:
     Every node id is asked for its device type; nodes that only send heartbeats are listed too.
     """
     from pmsmtool.bus.nmt import find_nodes
-    from pmsmtool.errors import BusError
 
     with bus.connect() as connection:
         found = [entry for entry in find_nodes(connection) if bus.node in (None, entry.node)]
@@ -48,7 +48,6 @@ def scan_command(bus: BusOptions, out: Output) -> None:
 def _facts(connection: Connection, entry: FoundNode, end_s: float) -> dict[str, Any]:
     from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
-    from pmsmtool.errors import BusError, SdoAbort
 
     facts: dict[str, Any] = {
         "node": entry.node,

@@ -18,6 +18,7 @@ import click
 from pmsmtool.cli.drive_access import LOOKING_S, new_file, open_node, warn_of_other_drive
 from pmsmtool.cli.options import DURATION, RATE, BusOptions, WholeNumber, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import ConfigError, NotAvailable, PmsmtoolError
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -142,7 +143,6 @@ def _check(signals: tuple[str, ...], path: Path | None) -> None:
     from difflib import get_close_matches
 
     from pmsmtool.drive.objects import LIVE
-    from pmsmtool.errors import ConfigError
 
     for pattern in signals:
         if not any(fnmatchcase(name, pattern) for name in LIVE):
@@ -157,7 +157,6 @@ def _chosen(node: DriveNode, signals: tuple[str, ...]) -> list[str]:
     """Return the names that are wanted; one that was typed and that the drive lacks is refused."""
     from pmsmtool.drive.logged_values import available
     from pmsmtool.drive.objects import LIVE
-    from pmsmtool.errors import NotAvailable
 
     wanted = signals or SHOWN
     names = available(node, lambda name: any(fnmatchcase(name, pattern) for pattern in wanted))
@@ -175,7 +174,6 @@ def _follow(
 ) -> None:  # fmt: skip
     """Read until the time is over, Ctrl-C or an error, at the pace of the wall clock; the page hears which it was."""
     from pmsmtool.drive.logged_values import readings, sent
-    from pmsmtool.errors import PmsmtoolError
 
     read = sent if pdo else readings
     begun, said_s = time.monotonic(), 0.0

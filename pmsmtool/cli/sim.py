@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,8 @@ import click
 from pmsmtool.cli.drive_access import map_option, new_file
 from pmsmtool.cli.options import BITRATE, FILE, BusOptions, WholeNumber, bus_options, examples, output_options
 from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import ConfigError
+from pmsmtool.files import write_file
 
 if TYPE_CHECKING:
     from pmsmtool.sim.channel import Channel
@@ -86,8 +89,6 @@ def serve_command(
     PROFILE is a profile (`pmsmtool sim list`), a machine file, or a channel string NAME?key=value&...; the options
     win over its keys. Any program with python-can's socketcand backend can join, several at a time.
     """
-    from dataclasses import replace
-
     from pmsmtool.sim.channel import build_line, parse_channel
     from pmsmtool.sim.serve import SocketcandServer
 
@@ -110,9 +111,6 @@ def serve_command(
 
 def _without_memory(channel: Channel) -> Channel:
     """Return the channel of drives whose memory forgets: a stored set would outrank that of the scenario."""
-    from dataclasses import replace
-
-    from pmsmtool.errors import ConfigError
     from pmsmtool.sim.channel import VOLATILE
 
     if channel.nv not in (None, VOLATILE):
@@ -180,7 +178,6 @@ def clone_command(
     MACHINE is the machine file, run directory or profile that says what is on the drive; the drive is only read.
     """
     from pmsmtool.cli.drive_access import open_node, read_map, warn_of_other_drive
-    from pmsmtool.files import write_file
     from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
     from pmsmtool.measurement.capabilities import examine
     from pmsmtool.measurement.clone import clone_drive

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pmsmtool.cli.options import FILE, TIME, WholeNumber, examples, output_options
-from pmsmtool.cli.output import Output, table
+from pmsmtool.cli.output import Output, figure_format, table
+from pmsmtool.errors import ConfigError
 from pmsmtool.units import RPM_PER_RAD_S
 
 if TYPE_CHECKING:
@@ -65,8 +66,6 @@ def simulate_command(
         raise click.UsageError("missing argument DESIGN: a design, a machine file, a run directory or a profile")
     if scenario is None:
         raise click.UsageError("which --scenario? --list names the built-in ones")
-    from pmsmtool.cli.output import figure_format
-    from pmsmtool.errors import ConfigError
     from pmsmtool.sim.simulate import find_drive, find_scenario, run_scenario
 
     if path is not None and path.suffix.lower() not in _SUFFIXES:

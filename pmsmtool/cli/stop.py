@@ -10,12 +10,12 @@ import click
 
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import BusError, PmsmtoolError
 
 if TYPE_CHECKING:
     from pmsmtool.bus.connection import Connection
     from pmsmtool.cia402 import State
     from pmsmtool.drive.drive_node import DriveNode
-    from pmsmtool.errors import PmsmtoolError
 
 
 @click.command("stop", epilog=examples("pmsmtool -i pmsmsim stop", "pmsmtool stop -n 5", "pmsmtool stop --all"))
@@ -48,7 +48,6 @@ def _whom(connection: Connection, node: int | None, everyone: bool) -> list[int]
     from pmsmtool.bus.nmt import find_nodes
     from pmsmtool.cli.drive_access import choose_node
     from pmsmtool.drive.stop import nobody_confirms
-    from pmsmtool.errors import BusError
 
     try:
         if not everyone:
@@ -68,7 +67,6 @@ def _stop_together(
     from concurrent.futures import ThreadPoolExecutor
 
     from pmsmtool.drive.stop import ask_at_once, quick_stop, stop_other_axes
-    from pmsmtool.errors import BusError, PmsmtoolError
 
     def stop(node: DriveNode) -> State | PmsmtoolError:
         try:

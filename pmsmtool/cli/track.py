@@ -12,14 +12,15 @@ import click
 
 from pmsmtool.cli.drive_access import map_option, new_run, open_drive, read_map, runs_option
 from pmsmtool.cli.options import ANY_PATH, DIR, FREQUENCY, TIME, BusOptions, bus_options, examples, output_options
-from pmsmtool.cli.output import Output
+from pmsmtool.cli.output import Output, table
+from pmsmtool.errors import Interrupted, PmsmtoolError
+from pmsmtool.units import format_estimate, format_quantity
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from pmsmtool.drive.canopen_drive import CanopenDrive
     from pmsmtool.drive_maps.drive_map import DriveMap
-    from pmsmtool.errors import Interrupted
     from pmsmtool.estimators.tracking_model import Known
     from pmsmtool.identification.track import Tracked
     from pmsmtool.machine.machine_file import MachineFile
@@ -109,7 +110,6 @@ def _live(
     drive_map: DriveMap,
 ) -> tuple[RunDirectory, Tracked]:
     """Observe the drive and follow what it showed; the run keeps what was seen, whatever ends it."""
-    from pmsmtool.errors import PmsmtoolError
     from pmsmtool.identification.track import follow, known_of, track_stage
     from pmsmtool.machine.machine_file import dump_machine_file
     from pmsmtool.measurement.by_injection import nameplate_of
@@ -163,8 +163,6 @@ def _observed(
 
 
 def _interrupted(run: RunDirectory) -> Interrupted:
-    from pmsmtool.errors import Interrupted
-
     if not _kept(run):
         return Interrupted("interrupted before anything was observed", where=str(run.path), hint="observe for longer")
     return Interrupted("what was observed until then is kept", where=str(run.path), hint=_replay(run))
@@ -187,9 +185,7 @@ def _described(path: Path) -> MachineFile:
 
 
 def _show(run: RunDirectory, found: Tracked, wanted: tuple[str, ...], out: Output) -> None:
-    from pmsmtool.cli.output import table
     from pmsmtool.report.report import total_interval
-    from pmsmtool.units import format_estimate, format_quantity
 
     units = {"R_s_ohm": "ohm", "psi_f_wb": "Wb"}
     path = found.track

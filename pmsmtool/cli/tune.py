@@ -13,7 +13,7 @@ import click
 from pmsmtool.cli.drive_access import map_option, read_map
 from pmsmtool.cli.options import DB, DEG, FILE, HZ, TOML, examples, options_named, output_options, overspeed_option
 from pmsmtool.cli.output import Output, figure_format, save_figure, table
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, Partial
 from pmsmtool.files import refuse_source, write_file
 from pmsmtool.units import unit_of_key
 
@@ -197,7 +197,6 @@ def _axis(
     from pmsmtool.commissioning.axis_design import axis_parameters, design_axis, flashed_design, not_offered, stored_in
     from pmsmtool.design.design_file import design_text
     from pmsmtool.design.tune_request import TuneRequest
-    from pmsmtool.errors import Partial
     from pmsmtool.machine.machine_file import load_machine_file
 
     for name in _LIMITS:

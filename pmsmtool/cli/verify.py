@@ -10,6 +10,7 @@ import click
 from pmsmtool.cli.drive_access import OWN_FAMILY, WHOLE_SET_S, map_of_drive, map_option, open_node
 from pmsmtool.cli.options import ANY_PATH, BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
+from pmsmtool.errors import VerifyMismatch
 
 
 @click.command(
@@ -32,7 +33,6 @@ def verify_command(bus: BusOptions, out: Output, source: Path, other_drive: bool
     """
     from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.commissioning.parameter_source import load_parameters
-    from pmsmtool.errors import VerifyMismatch
     from pmsmtool.flash.journal import read_snapshot
     from pmsmtool.flash.restore import check_snapshot, plan_download, plan_restore
     from pmsmtool.flash.whole_drive import is_whole, readdressed, whole_map
