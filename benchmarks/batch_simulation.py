@@ -28,8 +28,7 @@ from pmsmtool.design.tolerance import tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.proof.simulated_margins import torque_reversals, variations
-from pmsmtool.sim.closed_loop import open_simulation
-from pmsmtool.sim.monte_carlo import Variation, cores, simulate_many
+from pmsmtool.sim.closed_loop import Variation, cores, open_simulation, simulate_many
 from pmsmtool.sim.scenarios import Scenario
 
 PROFILES = Path(__file__).resolve().parent.parent / "profiles"

@@ -140,7 +140,7 @@ def _observed(
     drive: CanopenDrive, watch: Watch, run: RunDirectory, known: Known, out: Output, say: Callable[[str], None]
 ) -> Trace:
     """Observe, and have the run keep it also when something ends it early."""
-    from pmsmtool.drive.interruption import interrupts_deferred
+    from pmsmtool.drive.stop import interrupts_deferred
     from pmsmtool.identification.track import keep
     from pmsmtool.measurement.observe import GIVEN_BACK, Observations, observe_process_data, observe_recordings
 

@@ -21,9 +21,9 @@ from pmsmtool.drive.dead_man import DeadManProof, prove_dead_man, set_quick_stop
 from pmsmtool.drive.drive_node import is_safe, state_text
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
-from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.motion_objects import OVER_SPEED_TRIP, lowered_trip, trips_itself
 from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, ProfileMove, Recording, Shape
+from pmsmtool.drive.stop import interrupts_deferred
 from pmsmtool.errors import (
     BusError,
     DriveFault,

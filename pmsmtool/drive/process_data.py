@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.nmt import NmtCommand, NmtState, send_nmt
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.objects import LIVE, DriveObject
+from pmsmtool.drive.stop import interrupts_deferred
 from pmsmtool.errors import BusError, NotAvailable, SdoAbort, VerifyMismatch
 
 BORROWED = (2, 3, 4)

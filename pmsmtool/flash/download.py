@@ -20,9 +20,9 @@ from pmsmtool.bus.sdo_transfer import is_busy, when_ready
 from pmsmtool.bus.supervision import NodeReset
 from pmsmtool.drive import objects
 from pmsmtool.drive.drive_node import STORE_TIMEOUT_S, DriveNode, state_text
-from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
+from pmsmtool.drive.stop import interrupts_deferred
 from pmsmtool.errors import (
     DriveTimeout,
     Interrupted,

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pmsmtool.design.headroom import headroom
 from pmsmtool.design.loops.margins import MarginProblem, MarginRequest, evaluate, margin_problem
 from pmsmtool.design.ratings import base_speed_rpm, ratings_of
-from pmsmtool.design.tolerance import PARAMETERS, Samples
+from pmsmtool.design.tolerance import PARAMETERS, Samples, headroom
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible

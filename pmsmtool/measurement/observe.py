@@ -18,9 +18,9 @@ from pmsmtool.arrays import Array
 from pmsmtool.drive import objects
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import DriveNode
-from pmsmtool.drive.interruption import interrupts_deferred
 from pmsmtool.drive.objects import signal_unit
 from pmsmtool.drive.process_data import live_values, sent_every_s
+from pmsmtool.drive.stop import interrupts_deferred
 from pmsmtool.errors import ConfigError
 from pmsmtool.estimators.tracking_model import RISES, SIGNALS, steady, windows
 from pmsmtool.trace import Trace

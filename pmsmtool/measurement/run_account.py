@@ -20,7 +20,7 @@ from typing import Any
 from pmsmtool import __version__
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import RESTORED
-from pmsmtool.drive.interruption import interrupts_deferred
+from pmsmtool.drive.stop import interrupts_deferred
 from pmsmtool.errors import (
     ConfigError,
     Declined,

@@ -42,9 +42,8 @@ from pmsmtool.proof.drawn_machine import (
 )
 from pmsmtool.proof.plan import Experiment, ProofPlan
 from pmsmtool.proof.simulated_move import hold, record_move, weaken
-from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, image_of
+from pmsmtool.sim.closed_loop import DRIVE_SIGNALS, cores, image_of
 from pmsmtool.sim.kernel import Params, Part, Setup, Simulation, Truth
-from pmsmtool.sim.monte_carlo import cores
 from pmsmtool.sim.scenarios import MODES
 from pmsmtool.sim.simulated_machine import build_setup
 from pmsmtool.units import rpm_from_rad_s

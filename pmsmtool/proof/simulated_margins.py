@@ -30,9 +30,17 @@ from pmsmtool.design.tolerance import Samples, ToleranceBox, tolerance_box
 from pmsmtool.errors import NotAvailable
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.params.parameter_set import ParameterSet
-from pmsmtool.sim.closed_loop import drive_values, image_of, open_simulation
+from pmsmtool.sim.closed_loop import (
+    DriveRuns,
+    Variation,
+    cores,
+    drive_values,
+    image_of,
+    open_simulation,
+    simulate_many,
+    vary,
+)
 from pmsmtool.sim.kernel import STRUCTS, Params, Part, Setup, Signal, Truth
-from pmsmtool.sim.monte_carlo import DriveRuns, Variation, cores, simulate_many, vary
 from pmsmtool.sim.scenarios import MODES, SCHEDULES, Scenario, built_in
 from pmsmtool.units import rad_s_from_rpm
 

@@ -11,7 +11,6 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.linalg import expm
 
-from pmsmtool.design.headroom import HeadroomLimits, OperatingCells, headroom
 from pmsmtool.design.lookup.design import LookupRequest, _Problem
 from pmsmtool.design.lookup.grid import GridBounds, _voltage_excess
 from pmsmtool.design.lookup.table import speed_table, torque_limits
@@ -38,7 +37,7 @@ from pmsmtool.design.prediction import (
     predict,
 )
 from pmsmtool.design.ratings import SAG_SHARE, ratings, voltage_facts
-from pmsmtool.design.tolerance import Samples, tolerance_box
+from pmsmtool.design.tolerance import HeadroomLimits, OperatingCells, Samples, headroom, tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError, DesignInfeasible

@@ -16,7 +16,6 @@ from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
 from pmsmtool.design.design_file import Design, design_text
-from pmsmtool.design.headroom import Headroom, OperatingCells, _fluxes
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop, imc, second_order
 from pmsmtool.design.loops.margins import (
     BLOCK,
@@ -37,7 +36,7 @@ from pmsmtool.design.loops.sampled_loop import margins
 from pmsmtool.design.loops.speed_loop import SpeedGains, SpeedMethod, SpeedPath, speed_loop
 from pmsmtool.design.loops.vector_margins import current_response, vector_margins
 from pmsmtool.design.operating_machine import at_temperature
-from pmsmtool.design.tolerance import NORMAL_95, Samples, tolerance_box
+from pmsmtool.design.tolerance import NORMAL_95, Headroom, OperatingCells, Samples, _fluxes, tolerance_box
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.errors import ConfigError

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from pmsmtool.drive import interruption
-from pmsmtool.drive.interruption import interrupts_deferred
+from pmsmtool.drive import stop
+from pmsmtool.drive.stop import interrupts_deferred
 from pmsmtool.params.parameter_set import ParameterSet
 from tests.flash.interrupted import How, frames_of, interrupt
 from tests.flash.rig import SMALL, with_tables
@@ -39,7 +39,7 @@ def test_a_signal_that_is_held_says_why_and_for_how_long_and_no_longer(monkeypat
     said: list[str] = []
     heard: list[int] = []
     now = [100.0]
-    monkeypatch.setattr(interruption.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(stop.time, "monotonic", lambda: now[0])
     before = signal.signal(signal.SIGTERM, lambda number, frame: heard.append(number))
     with interrupts_deferred(said.append, "storing") as noted:
         signal.raise_signal(signal.SIGINT)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pmsmtool.design import headroom
+from pmsmtool.design import tolerance
 from pmsmtool.design.loops.current_loop import AxisPlant, axis_loop
 from pmsmtool.design.loops.margins import MarginRequest, margin_problem
 from pmsmtool.design.loops.sampled_loop import margins
@@ -110,15 +110,15 @@ def test_the_speed_loop_bears_a_wide_interval_of_the_inertia(name: str) -> None:
 
 def test_a_point_without_torque_is_not_out_of_reach(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a solution leaves of no torque has a sign, and an interval may turn it; measured 0 % before."""
-    solved = headroom.speed_table
+    solved = tolerance.speed_table
 
     def leaving(*arguments: Any, **named: Any) -> Any:
         table = solved(*arguments, **named)
         none = table.torque_nm[:, None, None] == 0.0
         return replace(table, achieved_torque_nm=np.where(none, -3.6e-21, table.achieved_torque_nm))
 
-    monkeypatch.setattr(headroom, "speed_table", leaving)
+    monkeypatch.setattr(tolerance, "speed_table", leaving)
     source = profile("interior-2k2")
     rated = ratings(source, 0.92 * source.inverter.V_max_v)
-    torque = headroom.operating_cells(source, rated, 0.08).torque_nm
+    torque = tolerance.operating_cells(source, rated, 0.08).torque_nm
     assert np.sum(torque == 0.0) > 1 and np.min(np.abs(torque[torque != 0.0])) > 1e-3

@@ -9,11 +9,8 @@ from typing import Any
 
 import pytest
 
-from pmsmtool.papers.current_step import q_steps
-from pmsmtool.papers.delay import delay_and_predictor
-from pmsmtool.papers.experiments import experiments
+from pmsmtool.papers.current_step import figures_b, q_steps
 from pmsmtool.papers.figure import Reproduction
-from pmsmtool.papers.horizon import horizons
 from pmsmtool.papers.random_steps import (
     plant_mismatch,
     random_steps,
@@ -21,6 +18,7 @@ from pmsmtool.papers.random_steps import (
     voltage_limit,
 )
 from pmsmtool.papers.speed_rise import speed_ramp, speed_steps
+from pmsmtool.papers.timing import delay_and_predictor, horizons
 from pmsmtool.papers.weakening import figure_11, figure_12, table_2
 
 pytestmark = pytest.mark.chain
@@ -32,7 +30,7 @@ MADE: dict[str, Callable[[], Reproduction]] = {
     "jercic-fig10": lambda: q_steps(1),
     "jercic-fig11": lambda: figure_11(1),
     "jercic-fig12": lambda: figure_12(1),
-    "jercic-experiments": lambda: experiments(1),
+    "jercic-experiments": lambda: figures_b(1),
     "jercic-table2": lambda: table_2(1),
     "jercic-horizon": lambda: horizons(1),
     "governor-random-steps": lambda: random_steps(1, CASES),

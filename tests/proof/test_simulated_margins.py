@@ -28,7 +28,7 @@ from pmsmtool.proof.simulated_margins import (
     simulated_margins,
     torque_reversals,
 )
-from pmsmtool.sim.monte_carlo import DriveRuns, simulate_many
+from pmsmtool.sim.closed_loop import DriveRuns, simulate_many
 
 PROFILES = Path(__file__).resolve().parents[2] / "profiles"
 DRIVES = 2 * BLOCK + 5

@@ -15,8 +15,7 @@ from pmsmtool.machine.flux_map import FluxMap, FluxScale, ScalableMap
 from pmsmtool.machine.flux_map_cells import library
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.params.parameter_set import ParameterSet
-from pmsmtool.sim.closed_loop import simulate
-from pmsmtool.sim.monte_carlo import DriveRuns, Variation, cores, simulate_many
+from pmsmtool.sim.closed_loop import DriveRuns, Variation, cores, simulate, simulate_many
 from pmsmtool.sim.scenarios import Scenario
 from tests.sim.bench import U_DC, values
 

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
 from pmsmtool.design.design_file import Design
-from pmsmtool.design.headroom import Headroom, HeadroomLimits, OperatingCells, headroom, operating_cells
 from pmsmtool.design.loops.current_loop import AxisPlant, CurrentGains, axis_loop
 from pmsmtool.design.loops.designed_loops import designed_speed_loop, least_inductance
 from pmsmtool.design.loops.sampled_loop import SampledLoop, margins
@@ -31,7 +30,15 @@ from pmsmtool.design.loops.vector_margins import (
     vector_margins,
 )
 from pmsmtool.design.ratings import ratings_of
-from pmsmtool.design.tolerance import Samples, ToleranceBox
+from pmsmtool.design.tolerance import (
+    Headroom,
+    HeadroomLimits,
+    OperatingCells,
+    Samples,
+    ToleranceBox,
+    headroom,
+    operating_cells,
+)
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.machine.temperature import magnet_flux_at, resistance_at
 from pmsmtool.plain_text import Summarised, Summary
