@@ -217,7 +217,7 @@ class DriveNode:
             )
 
     def _doubt(self, vendor: int, product: int, name: str) -> str:
-        """Say why a drive of a shared vendor number is not taken for its map's; empty when it is."""
+        """Say why a drive of an identity that others have, too, is not taken for its map's; empty when it is."""
         drive_map = _map_of(self.map, vendor, product)
         if drive_map is None or not drive_map.identity.shared:
             return ""
@@ -232,7 +232,8 @@ class DriveNode:
             return ""
         own = f"calls itself {name!r}" if name else "has no name (0x1008)"
         lacks = f" and lacks {', '.join(wrong)} of that family" if wrong else ""
-        return f"makers share vendor number {vendor:#010x}: this drive {own}{lacks}, so it is no {drive_map.name}"
+        other = "makers share" if drive_map.identity.names else "other kinds of drive have"
+        return f"{other} vendor number {vendor:#010x}: this drive {own}{lacks}, so it is no {drive_map.name}"
 
     def _text(self, index: int, sub: int) -> str:
         try:

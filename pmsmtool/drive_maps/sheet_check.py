@@ -39,8 +39,14 @@ def identity_of_sheet(sheet: Eds) -> tuple[int, int]:
 
 
 def family_of_sheet(sheet: Eds) -> DriveMap | None:
-    """Return the shipped map for the drive of a data sheet, None where there is none or the sheet does not say."""
-    return family_of(*identity_of_sheet(sheet))
+    """Return the shipped map for the drive of a data sheet, None where there is none or the sheet does not say.
+
+    Where others have that identity, too, name or marks of the family must be in the sheet.
+    """
+    found = family_of(*identity_of_sheet(sheet))
+    if found is None or any(word.lower() in sheet.product_name.lower() for word in found.identity.names):
+        return found
+    return found if all((index, sub) in sheet.objects for index, sub, _ in found.identity.marks) else None
 
 
 def unnamed_sheet(sheet: Eds, where: str) -> ConfigError:

@@ -18,7 +18,9 @@ from pmsmtool.drive.drive_node import DriveNode, vendor_product_serial
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive_maps.drive_map_file import dump_drive_map, map_hash, parse_drive_map
+from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.drive_maps.identity_rows import IdentityRows
+from pmsmtool.drive_maps.sheet_check import map_of_sheet
 from pmsmtool.drive_maps.shipped_maps import GENERIC, family_names, load_family
 from pmsmtool.errors import ConfigError
 from pmsmtool.flash.journal import Snapshot, parse_snapshot
@@ -28,7 +30,7 @@ from pmsmtool.measurement.capabilities import examine
 from pmsmtool.params.catalogue import BY_NAME, OWN_SCALES
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.sim.node.node import Node
-from tests.foreign.data_sheets import COMMON, Row, copley, epos4, identity, write_eds
+from tests.foreign.data_sheets import COMMON, Row, copley, epos4, faulhaber, identity, write_eds
 from tests.simulated_bus import settle
 
 OWN_SERIALS = [("epos4", (0x2100, 1), "U64", 0x0123_4567_89AB_CDEF), ("copley", (0x6510, 1), "U32", 0x89AB_CDEF)]
@@ -119,6 +121,18 @@ def test_another_maker_of_the_same_number_is_not_moved_or_written(tmp_path: Path
         own = replace(copleys, identity=replace(copleys.identity, names=(), marks=()))
         node.map = own
         check_motion(own, node.identity())  # a person's own map decides
+
+
+@pytest.mark.parametrize("brushed", [False, True])
+def test_a_controller_of_a_brushed_motor_is_not_taken_for_one_of_poles(tmp_path: Path, brushed: bool) -> None:
+    """One maker gives both kinds the same vendor and product; on the bus, and in a data sheet."""
+    rows = tuple(row for row in faulhaber() if not brushed or row[0] != 0x2350)
+    with opened(tmp_path, rows) as (node, _):
+        doubt = node.identity().doubt
+        assert examine(node).drive_map.name == (GENERIC if brushed else "faulhaber")
+    assert ("lacks 0x2350:03" in doubt and "other kinds of drive" in doubt) if brushed else not doubt
+    sheet = parse_eds(write_eds(tmp_path / "x.eds", rows).read_bytes())
+    assert map_of_sheet(sheet).name == (GENERIC if brushed else "faulhaber")
 
 
 def test_the_name_tells_it_where_it_says_so() -> None:
