@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import math
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -16,6 +17,7 @@ from pmsmtool.errors import SdoAbort
 
 if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
+    from pmsmtool.drive.port import Identity
 
 
 HEARTBEAT_PERIODS = 1.2
@@ -57,7 +59,7 @@ def read_facts(node: DriveNode) -> dict[str, Any]:
         "supported_modes": _whole(node, objects.SUPPORTED_MODES),
         "parameter_set": _parameter_set(node),
         "configured": _moment(days, milliseconds),
-        "limits": _limits(node),
+        "limits": _limits(node, identity),
     }
 
 
@@ -79,13 +81,21 @@ def _parameter_set(node: DriveNode) -> dict[str, Any] | None:
     }
 
 
-def _limits(node: DriveNode) -> dict[str, float | None]:
+def _limits(node: DriveNode, identity: Identity) -> dict[str, Any]:
+    """Return rated current and largest speed: of the maker's own object where the map of the family names it."""
     from pmsmtool.drive import objects
-    from pmsmtool.drive.motion_objects import rated_ma
+    from pmsmtool.drive.motion_objects import rated_current
+    from pmsmtool.measurement.capabilities import choose_map
 
-    rated = rated_ma(node)
+    node.map = choose_map(identity, None)
+    stands = rated_current(node)
+    held = None if stands is None else node.held(stands.item)
+    rms = None if stands is None or held is None else stands.per_count * held / math.sqrt(2.0)
+    decided = stands is not None and (node.map.staging or not stands.undecided)
     return {
-        "rated_current_arms": None if rated is None else rated / 1000.0,
+        "rated_current_arms": rms if decided else None,
+        "rated_current_a": rms,
+        "rated_current_object": None if rms is None else str(stands),
         "max_speed_rpm": _whole(node, objects.MAX_SPEED_RPM),
     }
 
@@ -124,9 +134,12 @@ def _lines(facts: dict[str, Any]) -> list[str]:
     ]
     if facts["error_code"]:
         lines.append(f"fault     {facts['error_code']:#06x} {facts['error_text']}")
-    rated = facts["limits"]["rated_current_arms"]
-    if rated is not None:
-        lines.append(f"rated     {rated:g} Arms ({rated * 2**0.5:.4g} Apk)")
+    rated, rms = facts["limits"]["rated_current_a"], facts["limits"]["rated_current_arms"]
+    if rms is not None:
+        lines.append(f"rated     {rms:.6g} Arms ({rms * 2**0.5:.4g} Apk)")
+    elif rated is not None:
+        where = facts["limits"]["rated_current_object"]
+        lines.append(f"rated     {rated:.6g} A in {where}: whether peak or rms is its maker's choice")
     if held is not None:
         known = "known" if held["known"] else "UNKNOWN to this program"
         stored = "stored" if held["stored"] else "NOT stored: a reset brings another set back"

@@ -171,6 +171,12 @@ def rated_apk(node: DriveNode) -> float:
             f"the drive does not report {NO_RATED}", where=f"node {node.node}",
             hint="`pmsmtool caps` lists what this drive can measure",
         )  # fmt: skip
+    if stands.per_count * found > RATED_RMS * MOST_RATED_MA:
+        raise NotAvailable(
+            f"no motor has the rated current that the drive reports: {format_current(stands.per_count * found)}",
+            where=f"node {node.node}, {stands}", likely="the object is a REAL32, or was never set",
+            hint="compare its type with the drive's manual, and state it in a map (`rated_current`)",
+        )  # fmt: skip
     return stands.per_count * found
 
 

@@ -171,3 +171,21 @@ def test_what_is_read_through_the_drives_own_map_is_not_marked(
 ) -> None:
     code, _, err = on(EPOS4, capsys, *command, "--map", "epos4")
     assert (code, "warning" in err) == (0, False), err
+
+
+@pytest.mark.parametrize(
+    ("family", "arms", "line"),
+    [
+        ("epos4", None, "rated     4.299 A in 0x3001:01: whether peak or rms is its maker's choice"),
+        ("copley", 6.08 / 2**0.5, "rated     4.29921 Arms (6.08 Apk)"),
+        ("cia402", None, "rated     4.299 A in 0x6075: whether peak or rms is its maker's choice"),
+    ],
+)
+def test_info_says_where_the_rated_current_stands_and_claims_no_kind(
+    tool: Tool, family: str, arms: float | None, line: str
+) -> None:
+    """It was read at 0x6075 alone, and called rms."""
+    asked = ("--sim", f"interior-2k2?nv=:memory:&drive={family}", "info")
+    limits = json.loads(tool(*asked, "--json")[1])["limits"]
+    assert limits["rated_current_arms"] == (None if arms is None else pytest.approx(arms))
+    assert line in tool(*asked)[1].splitlines()

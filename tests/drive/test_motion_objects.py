@@ -70,6 +70,16 @@ def test_rated_current(held: Held, rows: dict[str, MotionObject], apk: float | N
             assert motion.rated_apk(node) == pytest.approx(apk, rel=1e-12)
 
 
+def test_a_rated_current_that_no_motor_has_is_none() -> None:
+    """8 A in a REAL32, read as the whole number of a map: every limit above it would limit nothing."""
+    with (
+        drive({DriveObject(0x3001, 1, "I"): 0x4100_0000}, rated_current=own("mA rms", wire="UNSIGNED32")) as node,
+        pytest.raises(NotAvailable, match="no motor has the rated current") as caught,
+    ):
+        motion.rated_apk(node)
+    assert caught.value.where == "node 5, 0x3001:01" and "REAL32" in caught.value.likely
+
+
 I_Q = {"i_q_a": SignalCell(0x3002, 2, "INTEGER16", "mA peak", "s")}
 SHARE = {"i_q_a": SignalCell(0x3002, 2, "INTEGER16", "permille of 0x6075", "s")}
 SIGNAL = DriveObject(0x3002, 2, "h")

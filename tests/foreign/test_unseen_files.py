@@ -436,12 +436,12 @@ def test_parameters_of_a_drive_that_no_map_names_are_those_of_the_standard(tool:
 
 
 def test_a_row_that_this_drive_of_the_family_lacks_ends_no_dump(tool: Tool) -> None:
-    rows = tuple(row for row in faulhaber() if row[0] != 0x2350)
-    write_eds(Path("x.eds"), (*rows, (0x6081, 0, "U32", "rw", "1000")))
+    rows = tuple(row for row in epos4() if row[:2] != (0x3001, 3))
+    write_eds(Path("x.eds"), rows)
     code, said, told = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "param", "dump", "--all")
     assert code == 0 and "profile_speed_rpm = " in said
-    assert "left out: motor.pole_pairs: the drive has no object 0x2350:03" in told
-    code, said, _ = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "param", "get", "0x2333:01", "--json")
+    assert "left out: motor.pole_pairs: the drive has no object 0x3001:03" in told
+    code, said, _ = tool("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "param", "get", "0x3001:01", "--json")
     held = bytes.fromhex(json.loads(said)["parameters"][0]["bytes"])
     assert code == 0 and int.from_bytes(held, "little") == 6080, "the rehearsed motor's current (mA), 0 before"
 
@@ -479,23 +479,23 @@ def test_a_further_axis_that_stays_on_is_no_confirmed_stop(tool: Tool, word: str
 def test_what_caps_says_is_written_is_written_where_the_drive_lacks_another_row(
     tool: Tool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A Faulhaber without a pole number: `flash-params` refused the set, `backup` ended with exit code 4."""
-    rows = tuple(row for row in faulhaber() if row[0] != 0x2350)
-    write_eds(Path("x.eds"), (*rows, (0x6081, 0, "U32", "rw", "1000"), (0x1010, 1, "U32", "rw", "1")))
+    """A drive without a pole number: `flash-params` refused the set, `backup` ended with exit code 4."""
+    rows = tuple(row for row in epos4() if row[:2] != (0x3001, 3))
+    write_eds(Path("x.eds"), (*rows, (0x1010, 1, "U32", "rw", "1")))
     facts = json.loads(tool("caps", "--eds", "x.eds", "--json")[1])
-    assert list(facts["written"]) == ["reference.profile_speed_rpm"]
-    lacking = "the drive has no object 0x2350:03 (UNSIGNED16 in the map 'faulhaber', source 'poles')"
+    assert "reference.profile_speed_rpm" in facts["written"] and "motor.pole_pairs" not in facts["written"]
+    lacking = "the drive has no object 0x3001:03 (UNSIGNED8 in the map 'epos4', source 'eds')"
     assert facts["not_written"]["motor.pole_pairs"] == lacking
     wanted = {"motor.pole_pairs": 2.0, "reference.profile_speed_rpm": 700.0}
     Path("set.toml").write_text(ParameterSet(wanted).to_toml())
     channel = "interior-2k2?nv=:memory:&eds=x.eds"
     code, said, told = tool("--sim", channel, "--yes", "flash-params", "set.toml", "--json")
     assert code == 10 and json.loads(said)["outcome"]["written"] == 1, told
-    assert "not written: motor.pole_pairs: the drive has no object 0x2350:03" in told, "before the consent"
+    assert "not written: motor.pole_pairs: the drive has no object 0x3001:03" in told, "before the consent"
     assert tool("--sim", channel, "backup", "-o", "b.json")[0] == 0
     monkeypatch.setattr("pmsmtool.cli.flash_params._ask", lambda *args, **options: None)
     code, said, told = tool("--sim", channel, "flash-params", "set.toml", "--nodes", "1")
-    assert code == 10 and "PASS" in said and "motor.pole_pairs: the drive has no object 0x2350:03" in told
+    assert code == 10 and "PASS" in said and "motor.pole_pairs: the drive has no object 0x3001:03" in told
 
 
 def test_nothing_that_a_map_names_is_no_backup(tool: Tool) -> None:
