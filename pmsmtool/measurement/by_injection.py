@@ -26,7 +26,17 @@ from pmsmtool.identification.request import (
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import HALLS, EncoderParameters, InverterParameters, MachineLimits, MachineParameters
 from pmsmtool.measurement import flux_map, frequency_response, mechanics
-from pmsmtool.measurement.limits import DURATION_S, HEADROOM, Keep, Limits, Say, Task, require_speed, unused_current
+from pmsmtool.measurement.limits import (
+    DURATION_S,
+    HEADROOM,
+    Keep,
+    Limits,
+    Say,
+    Task,
+    require_speed,
+    sampled_speed,
+    unused_current,
+)
 from pmsmtool.measurement.measure import Measurement, starting_gains
 from pmsmtool.run_directory import Stage
 from pmsmtool.units import rad_s_from_rpm
@@ -190,7 +200,7 @@ def measure(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Sequence[st
     limits = Limits(
         I_nom_apk=nameplate.machine.I_nom_apk or envelope.i_max_apk,
         i_max_apk=envelope.i_max_apk,
-        omega_max_rad_s=envelope.speed_max_rad_s,
+        omega_max_rad_s=min(envelope.speed_max_rad_s, sampled_speed(nameplate)),
         V_max_v=nameplate.inverter.V_max_v,
         i_d_max_apk=envelope.i_d_max_apk,
     )

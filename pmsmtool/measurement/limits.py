@@ -61,6 +61,8 @@ HEADROOM = 1.2
 """Largest current of an envelope, of the rated one, where none is asked for."""
 LEAST_CURRENT = 0.2
 """Least share of a current that turns the shaft, to spare the supply."""
+SAMPLES_A_TURN = 12.0
+"""Samples of an electrical turn at the largest speed of the experiments: with 7.3 and 9.6 of it two drives tripped."""
 TRIP_SHARE = 0.85
 """Current that the pulses of a flux map aim at, of the drive's overcurrent trip."""
 
@@ -110,6 +112,11 @@ def require_speed(omega_max_rad_s: float, n_max_rpm: float) -> None:
             likely="the first short torque pulse exceeds it, and the back-EMF below it is too small to measure",
             hint=f"allow at least --speed-max {math.ceil(least)}rpm, or identify R, L and inverter only",
         )
+
+
+def sampled_speed(nameplate: MachineFile) -> float:
+    """Return the largest mechanical speed (rad/s) at which a drive samples a machine's currents often enough."""
+    return 2.0 * math.pi * nameplate.inverter.f_s_hz / (SAMPLES_A_TURN * nameplate.machine.pole_pairs)
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from click.testing import CliRunner
@@ -18,6 +19,7 @@ from pmsmtool.files import data_folder
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import MachineFile, load_machine_file
 from pmsmtool.machine.parameters import MachineLimits
+from pmsmtool.measurement import by_injection
 from pmsmtool.measurement.by_injection import envelope_of, nameplate_of, plan_lines
 from pmsmtool.measurement.limits import LEAST_CURRENT, LEAST_SPEED_SHARE, Limits, require_speed, unused_current
 from pmsmtool.params.catalogue import BY_NAME
@@ -74,6 +76,30 @@ def test_a_speed_limit_that_no_push_stays_within_is_refused_with_the_least_one()
     with pytest.raises(IdentificationError, match="E_EXCITATION") as caught:
         require_speed(0.999 * least_rad_s, 3000.0)
     assert f"--speed-max {LEAST_SPEED_SHARE * 3000.0:.0f}rpm" in caught.value.hint
+
+
+@pytest.mark.parametrize(("f_s_hz", "rpm"), [(4000.0, 425.53), (8000.0, 697.0)])
+def test_a_turn_is_sampled_a_dozen_times_at_the_largest_speed(
+    monkeypatch: pytest.MonkeyPatch, f_s_hz: float, rpm: float
+) -> None:
+    """A stepper motor of 47 pole pairs at 697 rpm on 4 kHz tripped in the run over speeds: 7.3 samples a turn."""
+    own = load_machine_file(data_folder("profiles") / "interior-2k2.toml")
+    stepper = replace(
+        own, machine=replace(own.machine, pole_pairs=47), inverter=replace(own.inverter, f_s_hz=f_s_hz), flux_map=None
+    )
+    given: dict[str, float] = {}
+
+    def limits(**parts: float) -> Limits:
+        given.update(parts)
+        raise ConfigError("enough is known")
+
+    monkeypatch.setattr(by_injection, "_nameplate", lambda task: stepper)
+    monkeypatch.setattr(by_injection, "Limits", limits)
+    task = SimpleNamespace(run=SimpleNamespace(save=lambda *_: None), request=IdentifyRequest())
+    envelope = replace(envelope_of(stepper, IdentifyRequest()), speed_max_rad_s=697.0 * math.pi / 30.0)
+    with pytest.raises(ConfigError, match="enough is known"):
+        by_injection.measure(task, envelope, lambda *_: None, lambda text: None)  # type: ignore[arg-type]
+    assert given["omega_max_rad_s"] == pytest.approx(rpm * math.pi / 30.0, rel=1e-4)
 
 
 def rated(i_nom_apk: float | None, i_trip_apk: float | None) -> MachineFile:
