@@ -157,6 +157,18 @@ def test_a_mean_friction_that_would_drive_the_shaft_is_no_viscous_one() -> None:
 
 
 @pytest.mark.chain
+def test_means_do_not_tell_a_drag_from_viscous_friction_and_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stranger's shaft with play: B 5.4 times too large at +-64 %, tau_c 20 % too small at +-8 %."""
+    monkeypatch.setattr(f"{__name__}.B", 0.0)
+    air = 0.5 * TAU_C / 613.0**2  # of the largest speed, 613 rad/s
+    traces = with_drag(run_of(np.random.default_rng(3), (J, 0.0, TAU_C)), air)
+    means = mean_mechanics(traces, lambda i_d, i_q: PER_A * i_q, 0.03, 1)
+    for name, true in (("B_nms", 0.0), ("tau_c_nm", TAU_C)):  # 0.41 and 0.34 of the intervals; 3.4 and 1.7 without
+        assert abs(means[name].value - true) <= 0.7 * 1.96 * means[name].std, name
+    assert 1.96 * means["tau_c_nm"].std < 0.5 * TAU_C
+
+
+@pytest.mark.chain
 def test_the_mean_friction_of_a_heavy_shaft_is_what_coasting_shows() -> None:
     """It hardly slows down: with a torque that is 1 % off, pushes said -0.06 of 0.86 N m, at +-0.26."""
     truth = (20.0 * J, B, TAU_C)

@@ -167,8 +167,8 @@ def test_the_derivative_of_a_run_is_that_of_differences(drag: bool) -> None:
     assert problem.residual(x)[-3:] == pytest.approx(x[first : first + 3])
 
 
-@pytest.mark.parametrize("power", [0.0, 1.0])
-def test_mean_motions_are_a_weighted_regression_of_mean_torques(power: float) -> None:
+@pytest.mark.parametrize(("power", "drag"), [(0.0, False), (1.0, False), (1.0, True)])
+def test_mean_motions_are_a_weighted_regression_of_mean_torques(power: float, drag: bool) -> None:
     """Parabolas in halves of what moves; a rest at the end is left out. Errors as shares: pushes are whole."""
     rng = np.random.default_rng(44)
     runs, rows, torques, states = [], [], [], []
@@ -182,7 +182,7 @@ def test_mean_motions_are_a_weighted_regression_of_mean_torques(power: float) ->
         half = (moving + 1) // 2
         for part in (slice(moving),) if power and not coasting else (slice(half), slice(half, moving)):
             omega = w + a * float(np.mean(t[part]))
-            rows.append([a, omega, math.copysign(1.0, omega)])
+            rows.append([a, omega * abs(omega) if drag else omega, math.copysign(1.0, omega)])
             torques.append(torque)
         states += [0.2, w]
     matrix, target = np.array(rows), np.array(torques)
@@ -191,7 +191,8 @@ def test_mean_motions_are_a_weighted_regression_of_mean_torques(power: float) ->
     weighted = matrix * weight[:, None]
     x, rest, *_ = np.linalg.lstsq(weighted, target * weight, rcond=None)
     std = np.sqrt(np.diag(np.linalg.inv(weighted.T @ weighted)) * rest[0] / (len(target) - 3))
-    found, covariance, begun = mechanics._mean_motion(runs, power)
+    found, covariance, begun, misfit = mechanics._mean_motion(runs, power, drag)
+    assert misfit == pytest.approx(float(rest[0]), rel=1e-3)
     deviations = np.sqrt(np.diag(covariance))
     assert found == pytest.approx(x, rel=1e-4) and deviations == pytest.approx(std, rel=1e-3)
     assert begun == pytest.approx(states, rel=1e-6, abs=1e-9)

@@ -14,6 +14,7 @@ interval is solved in closed form, with the instant of a reversal.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -218,6 +219,8 @@ def estimate_mechanics(
     others, of_it = np.delete(with_drag.jacobian, SHAFT, axis=1), with_drag.jacobian[:, SHAFT] * with_drag.x[SHAFT]
     start = np.delete(with_drag.x, SHAFT) + np.linalg.lstsq(others, of_it, rcond=None)[0]
     without = _minimum(noisy, start, sizes_of(blocks))
+    if without.cost < with_drag.cost:  # a drag of zero is better: its fit stopped short, or had less noise
+        with_drag = _minimum(noisy, np.insert(without.x, SHAFT, 0.0), sizes_of(blocks, drag=True))
     covariance, condition = scaled_covariance(without.jacobian)
     condition_gate(condition, "B and tau_c", STAGE, SEPARABLE)
     _, widen = chi2_gate(chi2, STAGE)
@@ -262,18 +265,25 @@ def mean_mechanics(
     runs = [_fast(_window(run)) for run in runs]
     step = encoder_step([run["theta_M_rad"] for run in runs])
     blocks = [_blocks(run, torque, 0.0, direction, 1, step, NO_HARMONICS, 0.0)[1] for run in runs]
-    values, covariance, _ = _mean_motion(blocks, power=1.0)
-    student = coverage_factor(sum(1 + run.coasting for run in blocks) - len(values)) / COVERAGE_FACTOR
-    stds = (student * np.sqrt(np.diag(covariance))).tolist()
+    rows = sum(1 + run.coasting for run in blocks)
+    # whether friction grows with the speed or with its square: means of a short coasting do not tell
+    fits = [_mean_motion(blocks, power=1.0, drag=drag) for drag in (False, True)]
+    (values, covariance, *_, misfit), (with_drag, of_drag, *_, beside) = fits
     if not values[0] > 0.0:
         return {}
+    dof = rows - len(values)
+    share = float(information_weights([dof * math.log(max(left, sys.float_info.min)) for left in (misfit, beside)])[1])
     values, _ = _held_at_zero(values, covariance, (1, 2))
-    if COVERAGE_FACTOR * max(stds[1] * fastest(blocks), stds[2]) > largest_torque(blocks):
-        values = values[:1]
+    apart = _held_at_zero(with_drag, of_drag, (1, 2))[0] * (1.0, 0.0, 1.0) - values
+    variance = (1.0 - share) * np.diag(covariance) + share * np.diag(of_drag) * (1.0, 0.0, 1.0)
+    stds = coverage_factor(dof) / COVERAGE_FACTOR * np.sqrt(variance)
+    unknown = COVERAGE_FACTOR * max(stds[1] * fastest(blocks), stds[2]) > largest_torque(blocks)
+    values, stds = values + share * apart, np.hypot(stds, math.sqrt(share * (1.0 - share)) * apart)
     scale, systematic = math.hypot(MEAN_STD, scale_std), (tolerance or SensorTolerance()).inertia
+    known = values.tolist()[: 1 if unknown else None]
     return {
         key: Estimate(v, math.hypot(std, scale * v), systematic * abs(v), unit, n=len(runs), method=MEAN_METHOD)
-        for v, std, (key, unit) in zip(values.tolist(), stds, MEANS.items(), strict=False)
+        for v, std, (key, unit) in zip(known, stds.tolist(), MEANS.items(), strict=False)
     }
 
 
@@ -385,14 +395,16 @@ def _blocks(run: Trace, torque: Torque, sigma_nm: float, direction: int, pole_pa
 
 def _start(runs: Sequence[Run]) -> Array:
     """Return ln J, B, tau_c and each trace's first position and speed, from a regression of torque on motion."""
-    x, _, states = _mean_motion(runs)
+    x, _, states, _ = _mean_motion(runs)
     if not x[0] > 0.0:
         raise refuse("E_NOT_IDENTIFIABLE", f"J = {x[0]:.3g} kg m2", stage=STAGE, likely="the shaft is held or driven")
     return np.array([math.log(x[0]), x[1], max(x[2], 0.0), *states])
 
 
-def _mean_motion(runs: Sequence[Run], power: float = 0.0) -> tuple[Array, NDArray[np.float64], list[float]]:
-    """Return J, B, tau_c of the mean torques and motions of half traces, their covariance, and the first states.
+def _mean_motion(
+    runs: Sequence[Run], power: float = 0.0, drag: bool = False
+) -> tuple[Array, NDArray[np.float64], list[float], float]:
+    """Return J, B (or a drag), tau_c of mean torques and motions, their covariance, first states and squared misfit.
 
     With a ``power`` of 1 errors are a share of the acceleration (pushes tell J, coasting friction), and a push is
     whole: half of one was a single swing of the shaft, which made J 34 % too large.
@@ -408,14 +420,15 @@ def _mean_motion(runs: Sequence[Run], power: float = 0.0) -> tuple[Array, NDArra
         ways = np.stack([run.theta, once, twice], axis=1)
         for part in np.array_split(np.arange(moving), 1 if power and not run.coasting else 2):
             a, omega, mean = 2.0 * np.polyfit(t[part], ways[part], 2)[0]
-            rows.append([a, omega, math.copysign(1.0, omega)])
+            rows.append([a, omega * abs(omega) if drag else omega, math.copysign(1.0, omega)])
             torques.append(float(mean))
         first = np.polyfit(t[: len(t) // 4], run.theta[: len(t) // 4], 2)
         states += [run.theta[0], float(first[1])]
     change = np.abs(np.array(rows)[:, 0])
     weight = (change + 1e-3 * np.max(change)) ** -power
     x, covariance, residual, _ = linear_solve(np.array(rows), np.array(torques), weight)
-    return x, covariance * (residual @ residual) / (len(rows) - len(x)), states
+    misfit = float(residual @ residual)
+    return x, covariance * misfit / (len(rows) - len(x)), states, misfit
 
 
 def _fit(runs: Sequence[Run], start: Array, elastic: bool) -> tuple[Fit, float, Sequence[Run]]:
