@@ -14,6 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
+import numpy as np
+
 from pmsmtool.drive.port import Drive
 from pmsmtool.errors import IdentificationError, PmsmtoolError
 from pmsmtool.estimators.current_sensors import Noise, estimate_noise
@@ -516,7 +518,11 @@ class Measurement:
         Current sensors that differ spoil every value, so that ends the run.
         """
         largest = self.limits.I_test_apk
-        currents = standstill.pair_currents(self._kept["levels"].meta["i_command_a"], largest)
+        currents = standstill.PAIR_SHARES[0] * largest, standstill.PAIR_SHARES[1] * largest
+        lost_v = [float(resistance.curve.error_v(0.5 * math.sqrt(3.0) * np.array(i))) for i in currents]
+        if lost_v[1] - lost_v[0] > 0.5 * math.sqrt(3.0) * resistance.R_measured.value * (currents[1] - currents[0]):
+            # in the knee of the inverter's curve, of which a chord between two levels is no part
+            currents = standstill.pair_currents(self._kept["levels"].meta["i_command_a"], largest)
         self.say(f"pairs of phases: two currents up to {currents[1]:.3g} A through each")
         turn_a, turn_s, quick = self.turn_share * largest, self._effort.turn_s, self._effort.quick
         start = float(self._kept["levels"]["theta_imposed_rad"][-1]) if quick else standstill.DC_ANGLE_RAD
