@@ -349,18 +349,19 @@ class DriveNode:
         if link_v is None:
             return "no DC-link voltage, or a missing hardware enable or safe-torque-off input"
         if link_v < LEAST_LINK_V:
-            counts = "" if "U_dc_v" in self.map.signals else ", where 0x6079 counts mV"
+            counts = ", where 0x6079 counts mV" if self.held(objects.DC_LINK_MV) is not None else ""
             return f"the supply of the power stage is off: the DC link has {link_v:.3g} V{counts}"
         return f"the safe-torque-off (STO) or enable input is open; the DC link has {link_v:.4g} V"
 
     def link_v(self) -> float | None:
-        """Return the voltage of the DC link by the object that the map names, else by 0x6079; None: it is not shown."""
-        signal = self.map.signals.get("U_dc_v")
-        item = objects.DC_LINK_MV
+        """Return the voltage of the DC link by the object that a maker's map names, else by 0x6079; None: not shown."""
+        signal = None if self.map.staging else self.map.signals.get("U_dc_v")
         if signal is not None:
-            item = DriveObject(signal.index, signal.sub, LETTERS[signal.wire])
-        held = self.held(item)
-        return None if held is None else held * (1e-3 if signal is None else wire_unit(signal.unit).scale)
+            held = self.held(DriveObject(signal.index, signal.sub, LETTERS[signal.wire]))
+            if held is not None:
+                return wire_unit(signal.unit).scale * held
+        held = self.held(objects.DC_LINK_MV)
+        return None if held is None else 1e-3 * held
 
     def disable_voltage(self, timeout_s: float = STATE_TIMEOUT_S) -> State | None:
         """Remove the voltage; return the state that the statusword then shows."""

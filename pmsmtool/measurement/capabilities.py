@@ -74,9 +74,9 @@ FEATURES: Mapping[str, str] = {
     "excitation": "voltage or current injection",
     "averages": "averages inside the drive",
     "recorder": "a recorder of currents and voltages that this program reads",
-    "torque mode": "torque mode (0x6502 bit 3 or 9; 0x6071, in permille)",
-    "push": "torque mode (0x6502 bit 3 or 9; 0x6071, in permille), or a velocity mode whose unit a map states, with a "
-    "current limit",
+    "torque mode": "torque mode (0x6502 bit 3 or 9; 0x6071, in permille to the rated current)",
+    "push": "torque mode (0x6502 bit 3 or 9; 0x6071, in permille to the rated current), or a velocity mode whose unit "
+    "a map states, with a current limit",
     "position": "position in units of a known number per turn (0x6064 with 0x608F, no gear or factor in 0x6091 and "
     "0x6093, or in a map: an object, or a number)",
     "range": f"a position of {LEAST_TURNS} turns or more before it begins again (32 bits in 0x6064, and 0x607B)",

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,7 +17,10 @@ from pmsmtool.drive.motion_objects import PERIOD_EXPONENT, PERIOD_VALUE, TORQUE_
 from pmsmtool.drive.objects import DC_LINK_MV, DriveObject
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.torque_drives import TorqueDrive
+from pmsmtool.drive_maps.drive_map import SignalCell
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import NotAvailable, SdoAbort
+from tests.drive.table_drive import node_of
 
 
 class Node:
@@ -97,18 +101,20 @@ def test_node_guarding_waits_as_long_as_the_heartbeat_would(monkeypatch: pytest.
 
 
 def test_of_the_voltages_only_the_link_has_an_object_of_every_drives() -> None:
-    drive = object.__new__(TorqueDrive)
-    shown = SimpleNamespace(index=0x2100, sub=1, wire="INTEGER16", unit="10 mV")
-    drive.node = Node({DC_LINK_MV: 48_000.0, DriveObject(0x2100, 1, "h"): 1234.0})  # type: ignore[assignment]
-    drive.node.map = SimpleNamespace(signals={})
-    assert drive.live("U_dc_v") == pytest.approx(48.0)
-    with pytest.raises(NotAvailable, match="does not show u_d_v"):
-        drive.live("u_d_v")
-    drive.node.map = SimpleNamespace(signals={"u_d_v": shown, "U_dc_v": shown})
-    assert drive.live("u_d_v") == drive.live("U_dc_v") == pytest.approx(12.34)
-    drive.node.objects.clear()  # type: ignore[attr-defined]
-    with pytest.raises(NotAvailable, match="does not show U_dc_v"):
-        drive.live("U_dc_v")
+    drive, family = object.__new__(TorqueDrive), load_family("cia402")
+    shown = SignalCell(0x2100, 1, "INTEGER16", "10 mV")
+    held = {DC_LINK_MV: 48_000, DriveObject(0x2100, 1, "h"): 1234}
+    with node_of(held, family) as (_, drive.node):
+        assert drive.live("U_dc_v") == pytest.approx(48.0)
+        with pytest.raises(NotAvailable, match="does not show u_d_v"):
+            drive.live("u_d_v")
+    with node_of(held, replace(family, signals={"u_d_v": shown, "U_dc_v": shown})) as (table, drive.node):
+        assert drive.live("u_d_v") == drive.live("U_dc_v") == pytest.approx(12.34)
+        del table.objects[0x2100, 1]
+        assert drive.live("U_dc_v") == pytest.approx(48.0), "the standard's, where it lacks its maker's own"
+        del table.objects[0x6079, 0]
+        with pytest.raises(NotAvailable, match="does not show U_dc_v"):
+            drive.live("U_dc_v")
 
 
 @pytest.mark.parametrize("by_ramp", [True, False])
