@@ -105,8 +105,8 @@ class _Record:
         """Store a record and compare it, unless its link is not the predicted one; False when it is grossly outside."""
         self.save(f"{experiment.name}.npz", trace_npz(trace))
         self.done.append(experiment.name)
-        if sagged := _sagged(experiment, trace, self.conditions):
-            self.left_out.append(f"{experiment.text}: {sagged}")
+        if apart := _link_apart(experiment, trace, self.conditions):
+            self.left_out.append(f"{experiment.text}: {apart}")
             return True
         self.measured |= responses({experiment.name: trace}, self.prediction)
         self.prediction = with_ripple(self.prediction, {experiment.name: trace})
@@ -115,14 +115,17 @@ class _Record:
         return max(shares) <= GROSS
 
 
-def _sagged(experiment: Experiment, trace: Trace, conditions: Conditions) -> str:
-    """Return how far the link fell in a record that it decides; empty where it kept what was predicted, or failed."""
+def _link_apart(experiment: Experiment, trace: Trace, conditions: Conditions) -> str:
+    """Return how far the link is from rest in a record that it decides; empty where it is as predicted, or failed."""
     if LINK not in experiment.signals:
         return ""
-    low, rest = float(np.quantile(trace[LINK], LOWEST_LINK)), conditions.U_dc_v
-    if not LINK_KEPT * rest <= low < rest * (1.0 - U_DC_SPREAD) - SEEN_SHARES[1] * conditions.U_dc_ripple_v:
-        return ""
-    return f"not judged: under load the DC link falls from {rest:.4g} to {low:.4g} V, and it decides the response"
+    low, high = (float(v) for v in np.quantile(trace[LINK], (LOWEST_LINK, 1.0 - LOWEST_LINK)))
+    rest, ripple_v = conditions.U_dc_v, SEEN_SHARES[1] * conditions.U_dc_ripple_v
+    if LINK_KEPT * rest <= low < rest * (1.0 - U_DC_SPREAD) - ripple_v:
+        return f"not judged: under load the DC link falls from {rest:.4g} to {low:.4g} V, and it decides the response"
+    if high > rest * (1.0 + U_DC_SPREAD) + ripple_v:
+        return f"not judged: braking raised the DC link from {rest:.4g} to {high:.4g} V, and it decides the response"
+    return ""
 
 
 def envelope_of(design: Design, request: ProofRequest, plan: ProofPlan | None = None) -> Envelope:

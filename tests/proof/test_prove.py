@@ -260,6 +260,22 @@ def test_what_a_sagging_link_decides_is_not_judged(design: Design) -> None:
     assert [line for line in stage.acceptance if line.what.startswith("q_steps")], "the rest is"
 
 
+def test_what_a_link_that_braking_raised_decides_is_not_judged(design: Design, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A rectifier takes nothing back: 360 V of 320 made a stranger's healthy drive fail at 142 % of a band."""
+    conditions_of = stages.conditions_of
+
+    def at_rest(*asked: Any) -> Conditions:
+        return replace(found := conditions_of(*asked), U_dc_v=found.U_dc_v / 1.08)
+
+    monkeypatch.setattr(stages, "conditions_of", at_rest)
+    with flashed(design) as drive:
+        _, stage = prove(drive, design, asked=replace(FEW, experiments=("q_steps", "unreachable")))
+    assert stage.status == "pass", stage.note
+    assert [line for line in stage.fallbacks if "not judged: braking raised the DC link from 500 to 540 V" in line]
+    assert {line.what.partition(":")[0] for line in stage.acceptance} >= {"q_steps"}
+    assert not [line for line in stage.acceptance if line.what.startswith("unreachable")]
+
+
 def test_a_supply_that_gives_way_bounds_the_power_of_a_proof(design: Design) -> None:
     """540 V behind 25 ohm: a proof at all of the current ended in the drive's under-voltage fault."""
     supply_w, per_a = 300.0, design.machine.machine.torque_nm(0.0, 1.0)
