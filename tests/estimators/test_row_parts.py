@@ -326,6 +326,7 @@ def test_a_ripple_is_taken_along_where_no_second_mass_is_left(
 
     monkeypatch.setattr(fr, "_judged", lambda *_: (next(told), None, None))
     monkeypatch.setattr(fr, "_ripple", ripple)
+    monkeypatch.setattr(fr, "counted", lambda _, omega: np.zeros(len(omega), dtype=np.bool_))  # no steps of the encoder
     found = fr.estimate_frequency_response([run] * 3, lambda d, q: q)
     assert found is results[taken] and len(ripples) == asked
 
