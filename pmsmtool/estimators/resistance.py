@@ -279,6 +279,9 @@ def estimate_resistance(
     std = math.sqrt(float(variance)) * (HARD_FACTOR if hardness > HARD_RATIO else 1.0)
     std = math.hypot(std, DRIFT_SECOND_ORDER * abs(drift) * R_w, tolerance.voltage_scale_std * R_w, misfit_ohm)
     _check_result(R_w, std, math.inf if COVERAGE_FACTOR * std < hidden else HALF_WIDTH_LIMIT)
+    told_of_link, left_out = _told_of_the_link(float(np.ptp(fall))), ""
+    if fit_from > FIT_FROM:
+        left_out = f"levels below {fit_from:g} of the largest left out: within the knee of the inverter's error"
     R_measured = Estimate(
         value=R_w,
         std=std,
@@ -290,9 +293,7 @@ def estimate_resistance(
         method="multi-level DC, asymptotic slope",
         i_d_apk=peak,
         dof=math.inf,
-        fallback="; ".join(
-            filter(None, (_told_of_the_link(float(np.ptp(fall))), WITHIN_KNEE if hidden > KNEE_TOLD * R_w else ""))
-        ),
+        fallback="; ".join(filter(None, (told_of_link, left_out, WITHIN_KNEE if hidden > KNEE_TOLD * R_w else ""))),
     )
     return ResistanceResult(
         R_s=normalised(R_measured, copper, tolerance),

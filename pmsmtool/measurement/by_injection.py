@@ -39,7 +39,7 @@ from pmsmtool.measurement.limits import (
 )
 from pmsmtool.measurement.measure import Measurement, starting_gains
 from pmsmtool.run_directory import Stage
-from pmsmtool.units import rad_s_from_rpm
+from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 
 
 def nameplate_of(drive: CanopenDrive, name: str = "") -> MachineFile:
@@ -197,10 +197,13 @@ def measure(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Sequence[st
 
     run, request, nameplate = task.run, task.request, _nameplate(task)
     run.save(NAMEPLATE, dump_machine_file(nameplate))
+    sampled_rad_s = sampled_speed(nameplate)
+    if sampled_rad_s < envelope.speed_max_rad_s:
+        say(f"speed at most {rpm_from_rad_s(sampled_rad_s):.0f} rpm: this drive samples too few times per turn beyond")
     limits = Limits(
         I_nom_apk=nameplate.machine.I_nom_apk or envelope.i_max_apk,
         i_max_apk=envelope.i_max_apk,
-        omega_max_rad_s=min(envelope.speed_max_rad_s, sampled_speed(nameplate)),
+        omega_max_rad_s=min(envelope.speed_max_rad_s, sampled_rad_s),
         V_max_v=nameplate.inverter.V_max_v,
         i_d_max_apk=envelope.i_d_max_apk,
     )

@@ -88,6 +88,7 @@ def test_a_turn_is_sampled_a_dozen_times_at_the_largest_speed(
         own, machine=replace(own.machine, pole_pairs=47), inverter=replace(own.inverter, f_s_hz=f_s_hz), flux_map=None
     )
     given: dict[str, float] = {}
+    said: list[str] = []
 
     def limits(**parts: float) -> Limits:
         given.update(parts)
@@ -98,8 +99,9 @@ def test_a_turn_is_sampled_a_dozen_times_at_the_largest_speed(
     task = SimpleNamespace(run=SimpleNamespace(save=lambda *_: None), request=IdentifyRequest())
     envelope = replace(envelope_of(stepper, IdentifyRequest()), speed_max_rad_s=697.0 * math.pi / 30.0)
     with pytest.raises(ConfigError, match="enough is known"):
-        by_injection.measure(task, envelope, lambda *_: None, lambda text: None)  # type: ignore[arg-type]
+        by_injection.measure(task, envelope, lambda *_: None, said.append)  # type: ignore[arg-type]
     assert given["omega_max_rad_s"] == pytest.approx(rpm * math.pi / 30.0, rel=1e-4)
+    assert [line[:22] for line in said] == (["speed at most 426 rpm:"] if rpm < 697.0 else [])
 
 
 def rated(i_nom_apk: float | None, i_trip_apk: float | None) -> MachineFile:
