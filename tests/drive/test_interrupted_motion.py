@@ -99,7 +99,9 @@ def test_second_terminal_stops_the_machine_of_the_first(server: Server, tmp_path
     done = subprocess.run(stop, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0 and "stopped" in done.stdout, done.stderr
     _, text = process.communicate(timeout=20)
-    assert process.returncode == 3 and "another master" in text, text
+    # on a busy computer the state may be read before the other master's frame is
+    seen = {3: "another master", 4: "another program stopped it"}
+    assert process.returncode in seen and seen[process.returncode] in text, text
     assert state_of_drive(server)[0] is State.SWITCH_ON_DISABLED
 
 
