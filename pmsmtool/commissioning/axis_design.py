@@ -52,38 +52,37 @@ Designed = Callable[[MachineFile, TuneRequest], Design]
 """A rule from machine and request to a design."""
 
 
-def held_by(drive_map: DriveMap, designed: Designed) -> Designed:
-    """Return a rule that designs for a drive: what :func:`held_design` makes of another rule's design.
+def design_for(drive_map: DriveMap, designed: Designed, source: MachineFile, request: TuneRequest) -> Design:
+    """Return what a drive holds of a rule's design (:func:`held_design`).
 
-    Current loops whose gains are beyond what the drive's objects hold are designed slower.
+    Current loops whose gains are beyond what the drive's objects hold are designed slower, and a note says so.
     """
-    fitting = _fitting(drive_map, designed)
-    return lambda source, request: held_design(fitting(source, request), drive_map)
+    design, slower = _fitting(drive_map, designed, source, request)
+    return held_design(replace(design, notes=(*design.notes, *slower)), drive_map)
 
 
-SLOWED = "slower by what the objects of"
 LEAST_SHARE = 0.1
 """Slowest current loop, of the one designed, that is taken for the limits of its objects: below, the drive does not fit
 the motor."""
 
 
-def _fitting(drive_map: DriveMap, designed: Designed) -> Designed:
-    """Return a rule whose current loops are so slow that the drive's objects hold their gains."""
+def _fitting(
+    drive_map: DriveMap, designed: Designed, source: MachineFile, request: TuneRequest
+) -> tuple[Design, list[str]]:
+    """Return a rule's design, its current loops so slow that the drive's objects hold their gains; and what is slower.
 
-    def rule(source: MachineFile, request: TuneRequest) -> Design:
-        design = designed(source, request)
-        wanted = replace(design, values={**design.values, **one_pair(design, drive_map.cells)}).parameter_set()
-        held = _slowed(drive_map, dict.fromkeys(CURRENT_GAINS, 1), wanted)
-        slower = [name for name, value in held.items() if value < wanted.values[name]]
-        share = min((held[name] / wanted.values[name] for name in slower), default=1.0)
-        if drive_map.staging or not LEAST_SHARE < share < 1.0:
-            return design
-        hertz = share * float(design.facts["current_bandwidth_rad_s"]) / math.tau
-        made = designed(source, replace(request, method="imc", bandwidth_hz=hertz))
-        note = f"current loops of {hertz:.4g} Hz, {SLOWED} {', '.join(slower)} hold"
-        return replace(made, notes=(*made.notes, note))
-
-    return rule
+    That is one line, or none.
+    """
+    design = designed(source, request)
+    wanted = replace(design, values={**design.values, **one_pair(design, drive_map.cells)}).parameter_set()
+    held = _slowed(drive_map, dict.fromkeys(CURRENT_GAINS, 1), wanted)
+    slower = [name for name, value in held.items() if value < wanted.values[name]]
+    share = min((held[name] / wanted.values[name] for name in slower), default=1.0)
+    if drive_map.staging or not LEAST_SHARE < share < 1.0:
+        return design, []
+    hertz = share * float(design.facts["current_bandwidth_rad_s"]) / math.tau
+    made = designed(source, replace(request, method="imc", bandwidth_hz=hertz))
+    return made, [f"current loops of {hertz:.4g} Hz, slower by what the objects of {', '.join(slower)} hold"]
 
 
 def held_design(design: Design, drive_map: DriveMap) -> Design:
@@ -126,10 +125,10 @@ def refused_by_limits(
     Raises ConfigError, DesignInfeasible: the machine has no such design.
     """
     asked = replace(request or TuneRequest(), governor="off", field_weakening="off", predictor=False)  # no such objects
-    made = _fitting(drive_map, tune)(source, asked)
+    made, slower = _fitting(drive_map, tune, source, asked)
     wanted = replace(made, values={**made.values, **one_pair(made, drive_map.cells)}).parameter_set()
     refused = drive_map.refused(without_assumed(drive_map, wanted)[0])
-    return refused, [note for note in made.notes if SLOWED in note]
+    return refused, slower
 
 
 _LOOPS = {CURRENT_LOOPS: "current loops", SPEED_LOOP: "speed loop"}

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from pmsmtool.commissioning.axis_design import Designed, held_by, why_not_judged
+from pmsmtool.commissioning.axis_design import Designed, design_for, why_not_judged
 from pmsmtool.design.closed_drive import (
     CURRENT,
     GAINS,
@@ -308,11 +308,11 @@ def closed_stage(run: RunDirectory, request: TuneRequest, drive_map: DriveMap, b
     if not reason:
         drive = ClosedDrive(drive_map.name, frozenset(drive_map.cells), bandwidth_hz)
         try:
-            stage = tune_stage(run, request, held_by(drive_map, partial(_limited, drive)))
+            stage = tune_stage(run, request, partial(design_for, drive_map, partial(_limited, drive)))
             return _judged(stage, load_design(run.path / "design.toml"), drive)
         except DesignInfeasible as error:
             reason = "; ".join(text for text in (error.what, error.likely) if text)
-    stage = tune_stage(run, request, held_by(drive_map, tune))
+    stage = tune_stage(run, request, partial(design_for, drive_map, tune))
     return replace(stage, fallbacks=(*stage.fallbacks, f"{LIMITS}: not available: {reason}"))
 
 
@@ -338,9 +338,9 @@ def closed_design(
     except NotAvailable as lacking:
         if any(value is not None for value in stated) or not drive_map.cells.keys() >= set(GAINS):
             raise
-        design = held_by(drive_map, tune)(source, request)
+        design = design_for(drive_map, tune, source, request)
         return replace(design, notes=(*design.notes, f"{LIMITS}: not available: {lacking.what}"))
-    return held_by(drive_map, partial(_limited, drive))(source, request)
+    return design_for(drive_map, partial(_limited, drive), source, request)
 
 
 def guaranteed(design: Design) -> bool:

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 from pmsmtool.cli.main import cli
-from pmsmtool.commissioning.axis_design import held_by, held_design, why_not_judged
+from pmsmtool.commissioning.axis_design import design_for, held_design, why_not_judged
 from pmsmtool.design.closed_drive import RATED, SLOPE, STATED, TORQUE
 from pmsmtool.design.design_file import Design, DesignValue, design_text, load_design, parse_design
 from pmsmtool.design.loops.designed_loops import CURRENT_GAINS, open_loops
@@ -94,14 +94,14 @@ def test_loops_whose_gains_the_objects_do_not_hold_are_designed_slower() -> None
     """With the margins of the gains that are written; a tenth of the bandwidth and less is no design for the drive."""
     machine, name = load_machine_file(machine_path("interior-2k2")), "current.K_p_q_v_per_a"
     whole = held_design(designed(), load_family("epos4"))
-    held = held_by(load_family("epos4").limited({(0x30A0, 1): (0, 50_000_000)}), tune)(machine, TuneRequest())
+    held = design_for(load_family("epos4").limited({(0x30A0, 1): (0, 50_000_000)}), tune, machine, TuneRequest())
     assert held[name] == 50.0 < whole[name]
     ratio = whole[name] / whole["current.K_i_q_v_per_as"]
     assert held[name] / held["current.K_i_q_v_per_as"] == pytest.approx(ratio, rel=1e-6)
     assert held.loops["current_d"].phase_margin_deg > whole.loops["current_d"].phase_margin_deg + 10.0
     assert any(f"{name}, current.K_i_q_v_per_as hold" in note for note in held.notes)
     with pytest.raises(ConfigError, match="cannot hold 1 value"):
-        held_by(load_family("epos4").limited({(0x30A0, 1): (0, 5_000_000)}), tune)(machine, TuneRequest())
+        design_for(load_family("epos4").limited({(0x30A0, 1): (0, 5_000_000)}), tune, machine, TuneRequest())
 
 
 def run(*arguments: str) -> tuple[int, str, BaseException | None]:
