@@ -88,18 +88,13 @@ class _Answers:
         self.angle = angle - self.held
         inside = [np.flatnonzero((self.grid >= begin) & (self.grid < end)) for begin, end in record.segments]
         self.parts = [part for part in inside if len(part) >= LEAST_SAMPLES]
-        self.times = np.array([at for at, _ in record.references])
-        self.values = np.array([value for _, value in record.references])
-        self.passed = np.concatenate(([0.0], np.cumsum(np.diff(self.times) * self.values[:-1])))
         speed = np.gradient(self.reference(0.0), GRID_S)
         corners = [share * bandwidth_rad_s for share in INSTRUMENTS]
         self.basis = np.linalg.qr(self.centred([_low(speed, c, n) for c in corners for n in (1, 2)]))[0]
 
     def reference(self, late_s: float) -> Array:
         """Return the angle that was asked for until then."""
-        x = self.grid - late_s
-        at = np.clip(np.searchsorted(self.times, x, side="right") - 1, 0, None)
-        angle: Array = self.passed[at] + (x - self.times[at]) * self.values[at] - self.held
+        angle: Array = self.record.asked_angle(self.grid - late_s) - self.held
         return angle
 
     def centred(self, columns: Sequence[Array]) -> Array:

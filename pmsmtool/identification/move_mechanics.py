@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from pmsmtool.arrays import Array
 from pmsmtool.axis.move import moving
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.shaft.inertia_ratio import LEAST_PUSHES, estimate_ratios
@@ -91,24 +90,22 @@ def _earlier(trace: Trace, delay_s: float) -> Trace:
 
 def _unexplained(halves: Sequence[Trace]) -> float:
     """Return the squared angle that torque, friction and drag leave, each half from its own place and speed."""
+    from scipy.integrate import cumulative_trapezoid
+
     angles, columns = [], []
     for half in halves:
         t, angle = half.t_s, half["theta_M_rad"]
         k = np.arange(len(t))
         ways = np.sign(angle[np.minimum(k + 5, k[-1])] - angle[np.maximum(k - 5, 0)])
-        drives = [_integral(t, _integral(t, drive)) for drive in (half["i_q_a"], ways)]
+        *pushes, way = cumulative_trapezoid([half["i_q_a"], ways, angle - angle[0]], t, initial=0.0)
         own, _ = np.linalg.qr(np.stack([np.ones_like(t), t], axis=1))
-        both = np.stack([angle, *drives, _integral(t, angle - angle[0])], axis=1)
+        both = np.stack([angle, *cumulative_trapezoid(pushes, t, initial=0.0), way], axis=1)
         both -= own @ (own.T @ both)
         angles.append(both[:, 0])
         columns.append(both[:, 1:])
     matrix, angle = np.vstack(columns), np.concatenate(angles)
     matrix /= np.sqrt(np.mean(matrix**2, axis=0))
     return float(np.sum((angle - matrix @ np.linalg.lstsq(matrix, angle, rcond=None)[0]) ** 2))
-
-
-def _integral(t: Array, x: Array) -> Array:
-    return np.concatenate(([0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * np.diff(t))))
 
 
 def _with_offset(

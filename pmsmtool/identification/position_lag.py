@@ -176,14 +176,18 @@ def _even_parts(t: Array, demand: Array) -> Iterator[tuple[int, int]]:
 
 def _fed_forward(trace: Trace) -> tuple[float, float]:
     """Return the share of the demanded speed that is fed forward, and its standard deviation."""
+    from scipy.integrate import cumulative_trapezoid
+
     t, demand, position = trace.t_s, trace["theta_ref_rad"], trace["theta_m_rad"]
-    columns = (demand, -position, *(_integral(t, x) for x in (_integral(t, demand - position), demand, position)))
+    lag, current = cumulative_trapezoid([demand - position, trace["i_q_a"]], t, initial=0.0)
+    columns = (demand, -position, *cumulative_trapezoid([lag, demand, position], t, initial=0.0))
     matrix = _changes(t, columns, WINDOW_S)
-    return _ratio(matrix, matrix, _changes(t, [_integral(t, trace["i_q_a"])], WINDOW_S)[:, 0])
+    return _ratio(matrix, matrix, _changes(t, [current], WINDOW_S)[:, 0])
 
 
 def _fed_forward_by_demand(trace: Trace, gain_per_s: float) -> tuple[float, float]:
     """Return the same by instruments without the noise of the position; ``gain_per_s`` of the lag is K_v / (1 - f)."""
+    from scipy.integrate import cumulative_trapezoid
     from scipy.signal import lfilter
 
     t, demand = trace.t_s, trace["theta_ref_rad"]
@@ -192,12 +196,13 @@ def _fed_forward_by_demand(trace: Trace, gain_per_s: float) -> tuple[float, floa
     for _ in range(FILTERS):
         filtered.append(lfilter([1.0 - keep], [1.0, -keep], filtered[-1]))
     instruments = [np.interp(t, grid, x) for x in filtered]
-    by_lag = gain_per_s * _integral(t, demand - trace["theta_m_rad"])
+    by_lag = gain_per_s * cumulative_trapezoid(demand - trace["theta_m_rad"], t, initial=0.0)
     pair = demand - by_lag, by_lag - trace["theta_m_rad"]
-    matrix = _changes(t, (*pair, *(_integral(t, x) for x in pair)), INSTRUMENT_WINDOW_S)
-    known = _changes(t, (*instruments, _integral(t, demand)), INSTRUMENT_WINDOW_S)
+    *ways, asked, charge = cumulative_trapezoid([*pair, demand, trace["i_q_a"]], t, initial=0.0)
+    matrix = _changes(t, (*pair, *ways), INSTRUMENT_WINDOW_S)
+    known = _changes(t, (*instruments, asked), INSTRUMENT_WINDOW_S)
     basis = np.linalg.qr(known)[0]
-    current = _changes(t, [_integral(t, trace["i_q_a"])], INSTRUMENT_WINDOW_S)[:, 0]
+    current = _changes(t, [charge], INSTRUMENT_WINDOW_S)[:, 0]
     return _ratio(matrix, basis @ (basis.T @ matrix), current)
 
 
@@ -221,10 +226,6 @@ def _ratio(matrix: Array, projected: Array, current: Array) -> tuple[float, floa
     share = of_demand / of_speed
     gradient = np.array([1.0 / size[0], -share / size[1]]) / of_speed
     return share, math.sqrt(float(gradient @ covariance[:2, :2] @ gradient))
-
-
-def _integral(t: Array, x: Array) -> Array:
-    return np.concatenate(([0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * np.diff(t))))
 
 
 def position_scale(

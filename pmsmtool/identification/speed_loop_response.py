@@ -99,6 +99,13 @@ class StepRecord:
     asked_later_s: float = 0.0
     """How much later than the current that one was read."""
 
+    def asked_angle(self, t_s: Array) -> Array:
+        """Return the angle that the references ask for up to instants (rad). Shape as ``t_s``."""
+        times, values = np.array(self.references).T
+        passed = np.concatenate(([0.0], np.cumsum(np.diff(times) * values[:-1])))
+        at = np.clip(np.searchsorted(times, t_s, side="right") - 1, 0, None)
+        return np.asarray(passed[at] + (t_s - times[at]) * values[at])
+
 
 @dataclass(frozen=True, slots=True)
 class SpeedLoop:
@@ -182,10 +189,8 @@ class _Model:
             t, position, current = record.t_s[::thin], record.position_rad[::thin], record.current_a[::thin]
             record = replace(record, t_s=t, position_rad=position, current_a=current)
         self.record = record
-        t, references = record.t_s, record.references
+        t = record.t_s
         self.grid = np.arange(t[0], t[-1] + GRID_S, GRID_S)
-        self.times = np.array([at for at, _ in references])
-        self.values = np.array([value for _, value in references]) - references[0][1]
         inside = [(t >= begin) & (t < end) for begin, end in record.segments]
         self.parts = [np.flatnonzero(part) for part in inside if np.count_nonzero(part) >= LEAST_SAMPLES]
         if not self.parts:
@@ -196,10 +201,7 @@ class _Model:
     def reference(self, late_s: float) -> Array:
         """Mean of the reference over each step of the grid, against the first one (rad/s)."""
         edges = np.append(self.grid, self.grid[-1] + GRID_S) - late_s
-        passed = np.concatenate(([0.0], np.cumsum(np.diff(self.times) * self.values[:-1])))
-        at = np.clip(np.searchsorted(self.times, edges, side="right") - 1, 0, None)
-        area = passed[at] + np.clip(edges - self.times[at], 0.0, None) * self.values[at]
-        mean: Array = np.diff(area) / GRID_S
+        mean: Array = np.diff(self.record.asked_angle(edges)) / GRID_S - self.record.references[0][1]
         return mean
 
     def modes(self, p: Array) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:

@@ -132,6 +132,8 @@ def _part(push: Trace, lag_s: float, whole: bool) -> Part | None:
 
     But for a ``whole`` push each way has its own w_0: what friction does where the shaft turns back is not seen.
     """
+    from scipy.integrate import cumulative_trapezoid
+
     skip = round(SKIP_SHARE * len(push))
     size = (len(push) - skip) // BLOCKS
     if size < 1:
@@ -144,13 +146,10 @@ def _part(push: Trace, lag_s: float, whole: bool) -> Part | None:
     w = np.diff(theta[edges]) / spans
     middle = 0.5 * (t[edges[1:]] + t[edges[:-1]])
     i_d = np.asarray(push["i_d_a"]) if "i_d_a" in push.signals else _left_of_slope(t, theta, i, size, lag_s)
-    charge, reluctance = (
-        np.interp(middle, t, np.concatenate(([0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * np.diff(t)))))
-        for x in (i, i * i_d)
-    )
+    charge, reluctance = (np.interp(middle, t, passed) for passed in cumulative_trapezoid([i, i * i_d], t, initial=0.0))
     way = np.interp(middle, t, theta - theta[0])
     sign = np.sign(w)
-    signs = np.concatenate(([0.0], np.cumsum(0.5 * (sign[1:] + sign[:-1]) * np.diff(middle))))
+    signs = cumulative_trapezoid(sign, middle, initial=0.0)
     moving = np.abs(w) >= STILL * np.abs(w).max()
     if moving.sum() < BLOCKS // 2:
         return None

@@ -409,6 +409,8 @@ def _mean_motion(
     With a ``power`` of 1 errors are a share of the acceleration (pushes tell J, coasting friction), and a push is
     whole: half of one was a single swing of the shaft, which made J 34 % too large.
     """
+    from scipy.integrate import cumulative_trapezoid
+
     rows, torques, states = [], [], []
     for run in runs:
         way = np.abs(np.diff(run.theta))
@@ -416,7 +418,7 @@ def _mean_motion(
         t = run.T * np.arange(moving)
         # what makes a parabola's curvature of the position makes it of the speed's and the torque's integrals, too
         gain = run.T * np.append(0.0, np.cumsum(run.torque))
-        once, twice = (run.T * np.append(0.0, np.cumsum(0.5 * (x[1:] + x[:-1]))) for x in (run.theta, gain))
+        once, twice = cumulative_trapezoid([run.theta, gain], dx=run.T, initial=0.0)
         ways = np.stack([run.theta, once, twice], axis=1)
         for part in np.array_split(np.arange(moving), 1 if power and not run.coasting else 2):
             a, omega, mean = 2.0 * np.polyfit(t[part], ways[part], 2)[0]
