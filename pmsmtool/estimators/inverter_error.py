@@ -32,6 +32,9 @@ from pmsmtool.estimators.least_squares import levenberg_marquardt
 
 KNEE_RANGE = 10.0
 """Ratio by which a knee may lie below the smallest level, or above the largest."""
+PHASE_FACTOR = math.sqrt(3.0) / 2.0
+"""Current of a phase over that of a vector that leaves one phase idle; its voltage error has the same factor, because
+v_beta = (e_b - e_c)/sqrt 3 with e_b = -e_c."""
 SAME_LEVEL = 1.1
 """Ratio of currents above which two points are different levels."""
 
@@ -53,6 +56,10 @@ class InverterCurve:
         x = np.concatenate([[0.0], self.i_phase_a])
         y = np.concatenate([[0.0], self.u_error_v])
         return np.asarray(np.sign(i_phase_a) * np.interp(magnitude, x, y), dtype=np.float64)
+
+    def vector_error_v(self, i_a: Array) -> Array:
+        """Error along a vector that leaves one phase idle, at its currents (V)."""
+        return self.error_v(PHASE_FACTOR * i_a) / PHASE_FACTOR
 
     def error_dq_v(self, i_d_a: Array, i_q_a: Array, theta_e_rad: Array) -> tuple[Array, Array]:
         """Error of the three phases in a frame at ``theta_e_rad`` (V, amplitude-invariant)."""
@@ -106,16 +113,13 @@ class InverterCurve:
         return math.exp(min(max(float(fit.x[0]), low), high))
 
 
-def curve_from_levels(i_vector_a: Array, u_vector_v: Array, phase_factor: float) -> InverterCurve:
+def curve_from_levels(i_vector_a: Array, u_vector_v: Array) -> InverterCurve:
     """Curve of one phase from the remainder of DC levels along a vector with one phase idle.
 
     Parameters
     ----------
     i_vector_a, u_vector_v : ndarray, shape (n,)
         Vector current and v - R i - v0 of each level, both signs.
-    phase_factor : float
-        Phase current over vector current, sqrt(3)/2 at 30 + k 60 degrees; the phase error is the vector error times
-        the same factor, because v_beta = (e_b - e_c)/sqrt 3 with e_b = -e_c.
     """
     magnitude = np.abs(i_vector_a)
     odd = np.sign(i_vector_a) * u_vector_v
@@ -128,7 +132,7 @@ def curve_from_levels(i_vector_a: Array, u_vector_v: Array, phase_factor: float)
         y.append(float(np.mean(odd[group])))
         if np.any(positive[group]) and not np.all(positive[group]):
             differences.append(abs(float(np.mean(odd[group][positive[group]]) - np.mean(odd[group][~positive[group]]))))
-    return InverterCurve(phase_factor * np.array(x), phase_factor * np.array(y), phase_factor * max(differences))
+    return InverterCurve(PHASE_FACTOR * np.array(x), PHASE_FACTOR * np.array(y), PHASE_FACTOR * max(differences))
 
 
 ROOT_3 = math.sqrt(3.0)

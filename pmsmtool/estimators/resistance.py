@@ -35,7 +35,7 @@ from pmsmtool.estimators.estimate import (
     condition_gate,
     information_weights,
 )
-from pmsmtool.estimators.inverter_error import InverterCurve, curve_from_levels
+from pmsmtool.estimators.inverter_error import PHASE_FACTOR, InverterCurve, curve_from_levels
 from pmsmtool.estimators.least_squares import linear_solve
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
@@ -118,8 +118,6 @@ levels whose slope counts. R of 0.4 A at 560 V: 1.7 % off, +-41 %, +-103 % by th
 KNEE_TOLD = 0.01
 """Part of R that the knee may hide from which on it is told: an inverter without an error has any knee."""
 WITHIN_KNEE = "the levels end within the knee of the inverter's error, part of which may be taken for R"
-PHASE_FACTOR = math.sqrt(3.0) / 2.0
-"""Current of a phase over that of the vector, with one phase idle; its voltage error has the same factor."""
 HARD_RATIO = 3.0
 """V_dead/(R I) above which the reference method covered 79 % only."""
 HARD_FACTOR = 2.0
@@ -224,14 +222,16 @@ def estimate_resistance(
     i, v = levels["i_d_a"], levels["u_d_v"]
     samples = int(levels.meta["samples"])
     peak = float(np.max(np.abs(i)))
+    used = np.abs(i) >= fit_from * peak
     R_0 = two_point_slope(i, v)
-    _check_levels(levels, i, peak, noise, fit_from)
+    _check_levels(levels, i, used, noise)
     noise_v = MEAN_NOISE_FACTOR * R_0 * noise.sigma_a / math.sqrt(samples)
     T = levels["T_winding_c"]
     known_T = bool(np.all(np.isfinite(T)))
     fall = _link_fall(levels, i, v - R_0 * i, noise_v)
-    warmth = _warmth(levels.t_s, T, fall, i, v, peak, math.hypot(noise_v, MODEL_FLOOR * R_0 * peak), fit_from)
-    sigma_v = _level_sigma(warmth, fall, i, v, peak, R_0, noise_v, fit_from)
+    sigma_v = math.hypot(noise_v, MODEL_FLOOR * R_0 * peak)
+    warmth = _warmth(levels.t_s, T, fall, i, v, used, sigma_v)
+    sigma_v = _level_sigma(warmth[used], fall[used], i[used], v[used], R_0, noise_v)
     T_w = float(np.sum(T * i**2) / np.sum(i**2)) if known_T else math.nan
     R_w, v_w = R_0, v
     fits: list[_TailFit] = []
@@ -240,7 +240,7 @@ def estimate_resistance(
         # R at T_w: what the copper part adds at each level's own temperature moves to the left side
         slope = _per_k(R_w, copper, T_w)
         v_w = v - slope * (T - T_w) * i if known_T else v
-        fits = [_fit_tail(warmth, fall, i, v_w, peak, sigma_v, powers, fit_from) for powers in tail_models()]
+        fits = [_fit_tail(warmth[used], fall[used], i[used], v_w[used], sigma_v, powers) for powers in tail_models()]
         weights = information_weights([_criterion(fit, len(i)) for fit in fits])
         R_w = float(sum(w * fit.x[0] for w, fit in zip(weights, fits, strict=True)))
     V_vector, v_0, drift, V_link = (
@@ -251,7 +251,7 @@ def estimate_resistance(
     best = min(fits, key=lambda fit: fit.chi2 / fit.dof)
     chi2 = best.chi2 / best.dof
     V_dead = V_vector * PHASE_FACTOR
-    curve = curve_from_levels(i, v_w - R_w * i - v_0 - V_link * np.sign(i) * fall, PHASE_FACTOR)
+    curve = curve_from_levels(i, v_w - R_w * i - v_0 - V_link * np.sign(i) * fall)
     lacking_v = abs(V_dead) - float(curve.error_v(np.array([PHASE_FACTOR * fit_from * peak]))[0])
     misfit = chi2 > CHI2_WARN and lacking_v > LACKING * R_w * peak
     if misfit and (more := [share for share in FIT_FROM_FURTHER if share > fit_from]):
@@ -287,7 +287,7 @@ def estimate_resistance(
         std=std,
         systematic=math.hypot(tolerance.impedance * R_w, hidden),
         unit="ohm",
-        n=int(np.sum(_fitted(i, peak, fit_from))),
+        n=int(np.sum(used)),
         chi2=chi2,
         T_c=T_w,
         method="multi-level DC, asymptotic slope",
@@ -339,17 +339,16 @@ def _told_of_the_link(fall: float) -> str:
     return told if fall >= LINK_TOLD else ""
 
 
-def _warmth(
-    t: Array, T: Array, fall: Array, i: Array, v: Array, peak: float, sigma_v: float, fit_from: float = FIT_FROM
-) -> Array:
-    """Return how the winding warms from level to level: with time, or where that does not fit, by its losses or sensor.
+def _warmth(t: Array, T: Array, fall: Array, i: Array, v: Array, used: NDArray[np.bool_], sigma_v: float) -> Array:
+    """Return how the winding warms from level to level (1): with time, or where that does not fit, by losses or sensor.
 
     What a sensor shows is a shape, too: of the loop only the copper warms, and how much of it that is, is not known.
+    Every level warms it; those ``used`` tell how. From the coldest to the warmest it is 1.
     """
     from scipy.optimize import minimize_scalar
 
     def misfit(warmth: Array) -> float:
-        columns, target, weight = _tail_rows(warmth, fall, i, v, peak, sigma_v, fit_from)
+        columns, target, weight = _tail_rows(warmth[used], fall[used], i[used], v[used], sigma_v)
         rows, shared = columns * weight[:, None], [*range(SHARED + 1), -1]  # each model has one column more, at most
         q = np.linalg.qr(rows[:, shared])[0]
         further = np.column_stack([target * weight, rows[:, SHARED + 1 : -1]])
@@ -358,38 +357,36 @@ def _warmth(
         return float(v_left @ v_left - np.max((v_left @ tails) ** 2 / np.sum(tails**2, axis=0)))
 
     found = minimize_scalar(
-        lambda log_tau: misfit(_heated(t, i, peak, math.exp(log_tau))),
+        lambda log_tau: misfit(_heated(t, i, math.exp(log_tau))),
         bounds=(math.log(WARMING_S[0]), math.log(WARMING_S[1])), method="bounded", options={"xatol": WARMING_TOLERANCE},
     )  # fmt: skip
-    shapes = [_heated(t, i, peak, math.exp(found.x))]
+    shapes = [_heated(t, i, math.exp(found.x))]
     if np.all(np.isfinite(T)) and np.ptp(T) > SENSED_K:
         shapes.append(T)
     best = min(shapes, key=misfit)
-    return best if misfit(best) < misfit(t) - WARMING_GAIN else t
+    chosen = best if misfit(best) < misfit(t) - WARMING_GAIN else t
+    return np.asarray(chosen / np.ptp(chosen))
 
 
-def _heated(t: Array, i: Array, peak: float, tau_s: float) -> Array:
+def _heated(t: Array, i: Array, tau_s: float) -> Array:
     """Return the warmth of a winding of one time constant (1), cold before the first level: late in every level."""
     passed = np.diff(t, prepend=t[0] - np.median(np.diff(t))) / tau_s
     out, warm = [], 0.0
-    for rest, late, heat in zip(-np.expm1(-passed), -np.expm1(-LATE * passed), (i / peak) ** 2, strict=True):
+    for rest, late, heat in zip(
+        -np.expm1(-passed), -np.expm1(-LATE * passed), (i / np.max(np.abs(i))) ** 2, strict=True
+    ):
         out.append(warm + late * (heat - warm))
         warm += rest * (heat - warm)
     return np.array(out)
 
 
-def _level_sigma(
-    t: Array, fall: Array, i: Array, v: Array, peak: float, R_0: float, noise_v: float, fit_from: float = FIT_FROM
-) -> float:
+def _level_sigma(warmth: Array, fall: Array, i: Array, v: Array, R_0: float, noise_v: float) -> float:
     """Standard deviation of one level (V): noise of the mean, and a model error as large as the levels scatter."""
+    peak = float(np.max(np.abs(i)))
     least = math.hypot(noise_v, MODEL_FLOOR_LEAST * R_0 * peak)
-    fits = (_fit_tail(t, fall, i, v, peak, least, powers, fit_from) for powers in tail_models())
+    fits = (_fit_tail(warmth, fall, i, v, least, powers) for powers in tail_models())
     scatter = min(fit.chi2 / fit.dof for fit in fits)
     return min(max(1.0, math.sqrt(scatter)) * least, math.hypot(noise_v, MODEL_FLOOR * R_0 * peak))
-
-
-def _fitted(i: Array, peak: float, fit_from: float = FIT_FROM) -> NDArray[np.bool_]:
-    return np.abs(i) >= fit_from * peak
 
 
 def two_point_slope(i: Array, v: Array) -> float:
@@ -413,12 +410,12 @@ def two_point_slope(i: Array, v: Array) -> float:
     return R_0
 
 
-def _check_levels(levels: Trace, i: Array, peak: float, noise: Noise, fit_from: float = FIT_FROM) -> None:
-    used = _fitted(i, peak, fit_from)
+def _check_levels(levels: Trace, i: Array, used: NDArray[np.bool_], noise: Noise) -> None:
+    peak, least = float(np.max(np.abs(i))), float(np.min(np.abs(i[used])))
     for sign in (1.0, -1.0):
         count = len(set(np.round(i[used & (np.sign(i) == sign)] / (0.02 * peak))))
         if count < TAIL_TERMS + 3:
-            what = f"{count} different levels of one sign above {fit_from:g} of the largest, {TAIL_TERMS + 3} needed"
+            what = f"{count} different levels of one sign from {least:.3g} to {peak:.3g} A, {TAIL_TERMS + 3} needed"
             raise refuse("E_EXCITATION", what, stage=STAGE)
     change, limit = _settling(levels, noise)
     worst = int(np.argmax(np.abs(change) / limit))
@@ -438,7 +435,7 @@ def _settling(levels: Trace, noise: Noise) -> tuple[Array, Array]:
     sigma = 2.0 * R_0 * noise.sigma_a / math.sqrt(int(levels.meta["samples"]))  # difference of two halves
     fit_limit = max(SETTLE_SIGMA * max(sigma, ripple), SETTLE_FLOOR * R_0 * peak)
     curve_limit = max(fit_limit, CURVE_SETTLE * float(np.max(np.abs(levels["u_d_v"]))))
-    return change, np.where(_fitted(i, peak), fit_limit, curve_limit)
+    return change, np.where(np.abs(i) >= FIT_FROM * peak, fit_limit, curve_limit)
 
 
 def unsettled(levels: Trace, noise: Noise) -> NDArray[np.bool_]:
@@ -477,16 +474,11 @@ def _per_k(R_ohm: float, copper: Copper, T_c: float) -> float:
     return copper.alpha_per_k * min(copper.R_winding_ohm or math.inf, all_copper)
 
 
-def _tail_rows(
-    t: Array, fall: Array, i: Array, v: Array, peak: float, sigma_v: float, fit_from: float
-) -> tuple[Array, Array, Array]:
+def _tail_rows(warmth: Array, fall: Array, i: Array, v: Array, sigma_v: float) -> tuple[Array, Array, Array]:
     """Return columns, target and weights of the levels: R, V, v_0, drift, what of V falls with the link, all tails."""
-    used = _fitted(i, peak, fit_from)
-    span = float(np.ptp(t))
-    i, v, t, fall = i[used], v[used], t[used], fall[used]
-    sign, u = np.sign(i), np.abs(i) / peak
-    centre = float(np.sum(t * i**2) / np.sum(i**2))
-    drift = i * (t - centre) / span  # zero at the mean heating: R belongs to T_w
+    sign, u = np.sign(i), np.abs(i) / np.max(np.abs(i))
+    centre = float(np.sum(warmth * i**2) / np.sum(i**2))
+    drift = i * (warmth - centre)  # zero at the mean heating: R belongs to T_w
     odd_tail = (sign / u**p for p in TAIL_POWERS)
     columns = np.stack([i, sign, np.ones_like(i), drift, sign * fall, *odd_tail, u**-EVEN_POWER], axis=1)
     # one row more: how much of V falls with the link is known about as well
@@ -498,12 +490,9 @@ def _tail_rows(
     return np.vstack([columns, share]), np.append(v, 0.0), weight
 
 
-def _fit_tail(
-    t: Array, fall: Array, i: Array, v: Array, peak: float, sigma_v: float, powers: tuple[int, ...],
-    fit_from: float = FIT_FROM,
-) -> _TailFit:  # fmt: skip
+def _fit_tail(warmth: Array, fall: Array, i: Array, v: Array, sigma_v: float, powers: tuple[int, ...]) -> _TailFit:
     """Fit the levels by a tail of some powers."""
-    columns, target, weight = _tail_rows(t, fall, i, v, peak, sigma_v, fit_from)
+    columns, target, weight = _tail_rows(warmth, fall, i, v, sigma_v)
     kept = [*range(SHARED), *(SHARED + TAIL_POWERS.index(p) for p in powers), -1]
     x, covariance, residual, condition = linear_solve(columns[:, kept], target, weight)
     return _TailFit(x, covariance, float(residual @ residual), len(residual) - len(x), condition)

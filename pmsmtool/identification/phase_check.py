@@ -186,7 +186,7 @@ def check_pairs(pairs: Trace, noise: Noise, curve: InverterCurve) -> PairCheck:
     order = np.argsort(pairs.meta.get("idle", list("aabbcc")), kind="stable")
     i, u = pairs["i_d_a"][order] / (1.0 - 0.5 * np.repeat(gains, 2)), pairs["u_d_v"][order]
     offset = math.hypot(noise.offset_d_a, noise.offset_q_a)
-    lost, beside = (curve.error_v(math.sqrt(3.0) / 2.0 * (i - off)) * 2.0 / math.sqrt(3.0) for off in (0.0, offset))
+    lost, beside = (curve.vector_error_v(i - off) for off in (0.0, offset))
     steps = np.diff(i)[::2]
     raw = np.diff(u)[::2] / steps
     taken = np.diff(lost)[::2] / steps

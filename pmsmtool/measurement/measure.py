@@ -519,8 +519,8 @@ class Measurement:
         """
         largest = self.limits.I_test_apk
         currents = standstill.PAIR_SHARES[0] * largest, standstill.PAIR_SHARES[1] * largest
-        lost_v = [float(resistance.curve.error_v(0.5 * math.sqrt(3.0) * np.array(i))) for i in currents]
-        if lost_v[1] - lost_v[0] > 0.5 * math.sqrt(3.0) * resistance.R_measured.value * (currents[1] - currents[0]):
+        lost_v = np.diff(resistance.curve.vector_error_v(np.array(currents)))[0]
+        if lost_v > resistance.R_measured.value * (currents[1] - currents[0]):
             # in the knee of the inverter's curve, of which a chord between two levels is no part
             currents = standstill.pair_currents(self._kept["levels"].meta["i_command_a"], largest)
         self.say(f"pairs of phases: two currents up to {currents[1]:.3g} A through each")

@@ -69,12 +69,10 @@ def resistance_figure(levels: Trace, R_ohm: float, curve: InverterCurve) -> Figu
     """
     i, u = levels["i_d_a"], levels["u_d_v"]
     offset = float(np.mean(u - R_ohm * i))
-    phase_factor = math.sqrt(3.0) / 2.0  # one phase idle at 30 + k 60 degrees
     canvas, (left, right) = _canvas(1, 2)
     left.plot(i, u, "o", ms=3.5, color=_MEASURED, label="levels")
     fine = np.linspace(float(np.min(i)), float(np.max(i)), 401)
-    error = curve.error_v(phase_factor * fine) / phase_factor
-    left.plot(fine, R_ohm * fine + error + offset, color=_MODEL, label="R i + inverter error")
+    left.plot(fine, R_ohm * fine + curve.vector_error_v(fine) + offset, color=_MODEL, label="R i + inverter error")
     left.plot(fine, R_ohm * fine, "--", color=_LIMIT, label="R i")
     left.set(xlabel="current along the vector / A", ylabel="commanded voltage / V")
     left.legend()

@@ -266,11 +266,10 @@ def test_the_error_along_an_axis_is_that_of_three_phases() -> None:
 def test_a_curve_is_the_mean_of_both_signs_of_a_level() -> None:
     i = np.array([1.0, -1.02, 2.0, -2.1, 4.0])
     u = np.array([0.5, -0.7, 0.9, -0.8, 1.2])
-    found = curve_from_levels(i, u, 0.8)
-    assert found.i_phase_a == pytest.approx(0.8 * np.array([1.01, 2.05, 4.0])) and found.asymmetry_v == pytest.approx(
-        0.16
-    )
-    assert found.u_error_v == pytest.approx(0.8 * np.array([0.6, 0.85, 1.2]))
+    found, phase = curve_from_levels(i, u), math.cos(math.pi / 6.0)  # current of a phase beside one without
+    assert found.i_phase_a == pytest.approx(phase * np.array([1.01, 2.05, 4.0]))
+    assert found.asymmetry_v == pytest.approx(phase * 0.2)
+    assert found.u_error_v == pytest.approx(phase * np.array([0.6, 0.85, 1.2]))
 
 
 def test_a_temperature_is_the_mean_of_what_records_and_sensors_say() -> None:

@@ -91,16 +91,16 @@ def test_five_levels_of_each_sign_are_needed() -> None:
     """Nine of 0.2 to 1: eight of them are above 0.28; two that differ by less than a fiftieth are one."""
     trace = _levels()
     i = trace["i_d_a"]
-    resistance._check_levels(trace, i, 10.0, NOISE)
+    resistance._check_levels(trace, i, np.abs(i) >= FIT_FROM * 10.0, NOISE)
     for sign in (1.0, -1.0):
         for count in (TAIL_TERMS + 3, TAIL_TERMS + 2):
             keep = (i * sign < 0.0) | (np.abs(i) > 10.05 - count) | (np.abs(i) < 0.25 * 10.0)
             few = np.where(keep, i, sign * 10.0)
             refused = pytest.raises(
-                IdentificationError, match=f"E_EXCITATION: 4 different levels .*above {FIT_FROM:g} .*, 5 needed"
+                IdentificationError, match="E_EXCITATION: 4 different levels of one sign from 3 to 10 A, 5 needed"
             )
             with nullcontext() if count == TAIL_TERMS + 3 else refused:
-                resistance._check_levels(trace, few, 10.0, NOISE)
+                resistance._check_levels(trace, few, np.abs(few) >= FIT_FROM * 10.0, NOISE)
 
 
 @pytest.mark.parametrize("share", [0.97, 1.03, -0.97, -1.03])
@@ -117,7 +117,7 @@ def test_a_level_whose_voltage_moves_is_refused_beyond_its_limit(share: float, s
     assert np.flatnonzero(unsettled(moving, noise)).tolist() == ([at] if abs(share) > 1.0 else [])
     told = f"E_NOT_SETTLED: at {i[at]:.3g} A the voltage still moves by {share * limit:.3g} V .*limit {limit:.3g} V"
     with nullcontext() if abs(share) < 1.0 else pytest.raises(IdentificationError, match=told.replace("+", ".")):
-        resistance._check_levels(moving, i, 10.0, noise)
+        resistance._check_levels(moving, i, np.abs(i) >= FIT_FROM * 10.0, noise)
 
 
 @pytest.mark.parametrize("shape", ["one way", "with the sign", "with the voltage"])
@@ -162,7 +162,8 @@ def test_the_tail_is_a_weighted_least_squares(powers: tuple[int, ...]) -> None:
     size = np.linalg.norm(matrix, axis=0)
     target = np.append(v[use], 0.0) * weight
     solution, chi2, *_ = np.linalg.lstsq(matrix / size, target, rcond=None)
-    fit = resistance._fit_tail(t, fall, i, v, 10.0, sigma_v, powers)
+    warmth = t[use] / np.ptp(t)
+    fit = resistance._fit_tail(warmth, fall[use], i[use], v[use], sigma_v, powers)
     assert fit.x == pytest.approx(solution / size, rel=1e-6, abs=1e-9) and fit.chi2 == pytest.approx(chi2[0], rel=1e-6)
     covariance = np.linalg.inv((matrix / size).T @ (matrix / size)) / np.outer(size, size)
     assert np.sqrt(np.diag(fit.covariance)) == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-5)
@@ -173,7 +174,7 @@ def test_the_tail_is_a_weighted_least_squares(powers: tuple[int, ...]) -> None:
 def test_a_winding_warms_as_its_differential_equation_has_it() -> None:
     """Cold one median step before the first level; each value at three quarters of its level. Measured: below 1e-8."""
     i, t, tau_s = np.array([5.0, -10.0, 8.0, 2.0]), np.array([1.0, 1.3, 1.6, 2.1]), 0.7
-    found = resistance._heated(t, i, 10.0, tau_s)
+    found = resistance._heated(t, i, tau_s)
     warm, before = 0.0, 0.7
     for k, now in enumerate(t):
         at = before + 0.75 * (now - before)
@@ -201,16 +202,18 @@ def test_what_a_winding_warms_by_is_told_from_its_sensor() -> None:
 
 def test_the_scatter_of_the_levels_decides_between_two_floors() -> None:
     trace = _levels()
-    i, v, none = trace["i_d_a"], trace["u_d_v"], np.zeros(48)
+    used = np.abs(trace["i_d_a"]) >= FIT_FROM * 10.0
+    t, i, v = trace.t_s[used], trace["i_d_a"][used], trace["u_d_v"][used]
+    none = np.zeros(len(i))
     noise_v, rough = 3e-4, R * 10.0
     least, most = math.hypot(noise_v, 1.2e-4 * rough), math.hypot(noise_v, 2e-4 * rough)
-    assert resistance._level_sigma(trace.t_s, none, i, v, 10.0, R, noise_v) == pytest.approx(least, rel=EXACT)
-    shape = np.random.default_rng(5).standard_normal(48)
+    assert resistance._level_sigma(t, none, i, v, R, noise_v) == pytest.approx(least, rel=EXACT)
+    shape = np.random.default_rng(5).standard_normal(48)[used]
     found = []
     for size in (1.3 * least, 10.0 * least):
-        found.append(resistance._level_sigma(trace.t_s, none, i, v + size * shape, 10.0, R, noise_v))
+        found.append(resistance._level_sigma(t, none, i, v + size * shape, R, noise_v))
         scatter = min(
-            (fit := resistance._fit_tail(trace.t_s, none, i, v + size * shape, 10.0, 1.0, powers)).chi2 / fit.dof
+            (fit := resistance._fit_tail(t, none, i, v + size * shape, 1.0, powers)).chi2 / fit.dof
             for powers in tail_models()
         )
         assert found[-1] == pytest.approx(min(math.sqrt(scatter), most), rel=1e-2)
@@ -369,10 +372,12 @@ def test_the_deviation_is_that_of_the_averaged_models_and_of_what_they_do_not_se
     found = estimate_resistance(trace, NOISE, tolerance=tolerance)
     R_0 = two_point_slope(i, v)
     noise_v = 1.05 * R_0 * 0.01 / 20.0
-    none = np.zeros(48)
-    warm = resistance._warmth(trace.t_s, trace["T_winding_c"], none, i, v, 10.0, math.hypot(noise_v, 2e-4 * R_0 * 10.0))
-    sigma_v = resistance._level_sigma(warm, none, i, v, 10.0, R_0, noise_v)
-    fits = [resistance._fit_tail(warm, none, i, v, 10.0, sigma_v, powers) for powers in tail_models()]
+    used = np.abs(i) >= FIT_FROM * 10.0
+    rough_v, T = math.hypot(noise_v, 2e-4 * R_0 * 10.0), trace["T_winding_c"]
+    warm = resistance._warmth(trace.t_s, T, np.zeros(48), i, v, used, rough_v)[used]
+    shown = (warm, np.zeros_like(warm), i[used], v[used])
+    sigma_v = resistance._level_sigma(*shown, R_0, noise_v)
+    fits = [resistance._fit_tail(*shown, sigma_v, powers) for powers in tail_models()]
     odds = np.exp(-0.5 * np.array([fit.chi2 + len(fit.x) * math.log(48.0) for fit in fits]))
     share = odds / np.sum(odds)
     each = np.array([fit.x[:4] for fit in fits])
