@@ -171,7 +171,8 @@ def make_plan(drive_map: DriveMap, wanted: ParameterSet, found: Mapping[str, byt
         entries.append(Change(name, index, sub, found[name], new, *values, unit))
     lacking = drive_map.not_written([*wanted.values, *wanted.tables])
     lacking = {name: why for name, why in lacking.items() if name not in given} | kept
-    return Plan(tuple(entries), lacking, wanted.content_hash(), {**drive_map.left_out, **kept}, tuple(kept))
+    stay = {name: why for name, why in lacking.items() if name in drive_map.cells}
+    return Plan(tuple(entries), lacking, wanted.content_hash(), {**drive_map.left_out, **stay}, tuple(stay))
 
 
 def without_assumed(drive_map: DriveMap, wanted: ParameterSet) -> tuple[ParameterSet, dict[str, str]]:

@@ -11,7 +11,7 @@ import pytest
 
 from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.design.ratings import GIVEN, rating_values, ratings
-from pmsmtool.drive_maps.drive_map import reference_map
+from pmsmtool.drive_maps.drive_map import IN_AMPERES, reference_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError
 from pmsmtool.flash.plan import KIND_LEAST, Change, Plan, differences, make_plan, names_to_read
@@ -61,6 +61,15 @@ def test_a_drive_set_up_for_another_motor_is_refused(ratio: float) -> None:
         planned(0.5, 0.5 * ratio)
     assert "0.4204 per ampere peak and 0.5946 per ampere rms" in caught.value.what
     assert f"holds {0.5 * ratio:.4g} N m/A" in caught.value.what and "0x3001:05" in caught.value.where
+
+
+def test_a_gain_in_amperes_without_the_torque_of_one_is_named() -> None:
+    """It was counted among those that the map has no object for."""
+    name, found = "speed.K_p_nms_per_rad", {"speed.K_p_nms_per_rad": u32(1000)}
+    plan = make_plan(EPOS4, ParameterSet({name: 0.2}), found)
+    assert not plan.entries and plan.missing == plan.kept == (name,)
+    tell_lacking(Mock(map=EPOS4), plan)  # no row of the map is wrong
+    assert plan.left_out() == [f"not written: {name}: {IN_AMPERES}"]
 
 
 @pytest.mark.parametrize("increments", [0, 4, 4096, 524288])
