@@ -163,9 +163,12 @@ def _unwritten(found: Capabilities) -> dict[str, str]:
 
 def _parameter_lines(found: Capabilities, sources: bool) -> list[str]:
     """Say value by value what `flash-params` writes; what the map does not even name is a number (-v: by name)."""
+    from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, named_addresses
+    from pmsmtool.measurement.learn_position_gain import POSITION
     from pmsmtool.params.catalogue import BY_NAME
 
     drive_map = found.drive_map
+    learned = ", ".join(name for name in (GAIN, INTEGRAL, POSITION) if named_addresses(drive_map, name))
     others = len(drive_map.not_written(BY_NAME).keys() - drive_map.left_out.keys())
     reasons = ((drive_map.row_text(n) if sources else n, why) for n, why in _unwritten(found).items())
     written = {name: drive_map.cells[name] for name in _written(found)}
@@ -181,6 +184,7 @@ def _parameter_lines(found: Capabilities, sources: bool) -> list[str]:
         *(f"not written: {line}" for line in by_reason(reasons)),
         *(f"not written: {name}: {why}" for name, why in drive_map.left_out.items() if name in BY_NAME),
         *([f"not written: {others} other parameters, which the map has no row for"] if others else []),
+        *([f"`pmsmtool map learn` measures on the free shaft what a count is worth of: {learned}"] if learned else []),
     ]
 
 

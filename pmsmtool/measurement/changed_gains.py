@@ -19,7 +19,7 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import GuardedDrive, guarded
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.torque_drives import TorqueDrive
-from pmsmtool.drive_maps.drive_map import LETTERS
+from pmsmtool.drive_maps.drive_map import LETTERS, DriveMap
 from pmsmtool.errors import IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal, SdoAbort
 from pmsmtool.flash.gain_journal import GainJournal
 from pmsmtool.flash.journal import Entry
@@ -65,7 +65,7 @@ def gain_address(node: DriveNode, name: str) -> tuple[int, int]:
     """
     if name in node.map.cells:
         return node.map.address(name)
-    told = named_addresses(node, name)
+    told = named_addresses(node.map, name)
     for address in (*told, STANDARD[name]):
         if node.has(*address):
             return address
@@ -76,9 +76,9 @@ def gain_address(node: DriveNode, name: str) -> tuple[int, int]:
     )  # fmt: skip
 
 
-def named_addresses(node: DriveNode, name: str) -> list[tuple[int, int]]:
+def named_addresses(drive_map: DriveMap, name: str) -> list[tuple[int, int]]:
     """Return the objects that the map of a drive names for a gain whose unit nobody publishes."""
-    places = ADDRESS.findall(HOLDS.split(node.map.left_out.get(name, ""))[0])
+    places = ADDRESS.findall(HOLDS.split(drive_map.left_out.get(name, ""))[0])
     return [(int(index, 16), int(sub, 16)) for index, sub in places]
 
 

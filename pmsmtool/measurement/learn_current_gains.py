@@ -79,7 +79,7 @@ def current_gain_objects(node: DriveNode, asked: Mapping[str, tuple[int, int] | 
     names = (CURRENT_GAIN, CURRENT_INTEGRAL)
     if not set(names) & set(asked) or recorder_of_currents(node) is None:
         return {}
-    told = [asked.get(name) or next(iter(named_addresses(node, name)), None) for name in names]
+    told = [asked.get(name) or next(iter(named_addresses(node.map, name)), None) for name in names]
     places = [place for place in told if place is not None and node.has(*place)]
     if len(places) < len(names):
         return {}

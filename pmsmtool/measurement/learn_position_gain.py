@@ -79,7 +79,7 @@ def position_gain_objects(node: DriveNode, asked: Mapping[str, tuple[int, int] |
 
 
 def _place(node: DriveNode, name: str) -> tuple[int, int] | None:
-    return next((address for address in named_addresses(node, name) if node.has(*address)), None)
+    return next((address for address in named_addresses(node.map, name) if node.has(*address)), None)
 
 
 def forward_objects(node: DriveNode) -> dict[str, GainObject]:
