@@ -36,6 +36,8 @@ PROFILE = (
     "reference.profile_deceleration_rpm_per_s", "reference.profile_jerk_rpm_per_s2",
 )  # fmt: skip
 AXIS_GAINS = (*SPEED, *SPEED_FORWARD, *CASCADE[:2], *PID[:3], CASCADE[2], LEAD, PID[3])
+CURRENT = ("current.K_p_q_v_per_a", "current.K_i_q_v_per_as")
+"""Gains of the loop below, which the set of an axis does not write."""
 AXIS_ROWS = frozenset((TORQUE_PER_AMPERE, INCREMENTS, *AXIS_GAINS, *NOTCH, *PROFILE))
 """What the design of an axis decides, and what is written into a drive for it."""
 LOOSEST = Limits(20.0, 12.0)
@@ -197,7 +199,7 @@ def axis_path(
 def _current(design: Design) -> SampledLoop:
     machine, inverter = design.machine.machine, design.machine.inverter
     plant = AxisPlant(machine.R_s_ohm, machine.L_q_h, inverter.T_s, inverter.delay_periods)
-    gains = CurrentGains(design["current.K_p_q_v_per_a"], design["current.K_i_q_v_per_as"])
+    gains = CurrentGains(*(design[name] for name in CURRENT))
     return axis_loop(gains, plant, plant if design.request.get("predictor") else None)
 
 

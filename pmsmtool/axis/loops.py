@@ -91,13 +91,13 @@ class AxisPath:
     @property
     def lag_s(self) -> float:
         """Sum of the small time constants and delays between speed and torque (s)."""
-        current = 1.0 / _bandwidth(self.current)
+        current = 1.0 / bandwidth(self.current)
         estimate = 2.0 / self.pll_rad_s if self.pll_rad_s else 0.5 * self.T
         smoothing = 1.0 / (2.0 * math.pi * self.filter_hz) if self.filter_hz else 0.0
         return current + self.current.delay_s + estimate + smoothing + (0.5 + self.late) * self.T
 
 
-def _bandwidth(loop: SampledLoop) -> float:
+def bandwidth(loop: SampledLoop) -> float:
     """Return about where a loop that crosses once has |L| = 1 (rad/s)."""
     omega = np.geomspace(1e-4, 1.0, 200) * math.pi / loop.T_s
     return float(omega[np.argmin(np.abs(np.log(np.abs(loop.at(omega)))))])

@@ -16,7 +16,7 @@ from contextlib import AbstractContextManager
 import numpy as np
 
 from pmsmtool.arrays import Array
-from pmsmtool.axis.drive import AXIS_GAINS, NOTCH
+from pmsmtool.axis.drive import AXIS_GAINS, CURRENT, NOTCH
 from pmsmtool.bus.abort_codes import AbortCode
 from pmsmtool.bus.connection import Connection
 from pmsmtool.cia402 import Mode
@@ -148,8 +148,8 @@ class PositionDrive(TorqueDrive):
         self.compared = ComparedSpeed(self.node, self.counts_per_turn)
 
     def held_gains(self) -> dict[str, float]:
-        """Return gains of speed and position, and notch, that the drive holds now, by their names; those of its map."""
-        held = {name: self.parameters.held_value(name) for name in (*AXIS_GAINS, *NOTCH)}
+        """Return gains of position, speed and current, and notch, that the drive holds, by name; those of its map."""
+        held = {name: self.parameters.held_value(name) for name in (*AXIS_GAINS, *NOTCH, *CURRENT)}
         return {name: value for name, value in held.items() if value is not None}
 
     # ---- motion ---------------------------------------------------------------------------------
