@@ -77,7 +77,7 @@ def flash_fleet(
     from pmsmtool.cli.flash_session import checked_identity
     from pmsmtool.drive.drive_lock import claim
     from pmsmtool.drive.drive_node import DriveNode
-    from pmsmtool.flash.download import Download, run_all, set_named
+    from pmsmtool.flash.download import Download, refuse_empty, run_all, set_named
     from pmsmtool.flash.journal import JournalFolder
     from pmsmtool.flash.map_gate import check_nodes
     from pmsmtool.flash.restore import marks_of, plan_download, tell_lacking
@@ -101,6 +101,8 @@ def flash_fleet(
         lines = _grouped(jobs)
         if dry_run or check:
             out.result("flash-params", {"nodes": plans}, lines)
+            for job in jobs:
+                refuse_empty(job.node, job.plan)
             different = sum(bool(job.plan.changes) for job in jobs)
             if check and different:
                 raise CheckFailed(

@@ -34,11 +34,13 @@ def carry_out(
     check: bool = False,
 ) -> None:
     """Plan, ask, write, print; the download is put into ``jobs`` (``flash.download.set_named``)."""
+    from pmsmtool.flash.download import refuse_empty
     from pmsmtool.flash.restore import plan_download, tell_lacking
 
     if dry_run or check:
         identity, plan = checked_identity(node, out), plan_download(node, wanted)
         out.result(command, {"identity": identity, **plan.facts()}, plan.lines())
+        refuse_empty(node, plan)
         if check and plan.changes:
             different = f"the drive differs in {counted(len(plan.changes), 'object')}"
             raise CheckFailed(different, where=f"node {node.node}", hint="run without --check to write them")

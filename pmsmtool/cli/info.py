@@ -6,11 +6,12 @@ from __future__ import annotations
 import contextlib
 import datetime
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from pmsmtool.cli.drive_access import LOOKING_S, open_node
+from pmsmtool.cli.drive_access import LOOKING_S, map_option, open_node, read_map, warn_of_other_drive
 from pmsmtool.cli.options import BusOptions, bus_options, examples, output_options
 from pmsmtool.cli.output import Output
 from pmsmtool.errors import SdoAbort
@@ -18,6 +19,7 @@ from pmsmtool.errors import SdoAbort
 if TYPE_CHECKING:
     from pmsmtool.drive.drive_node import DriveNode
     from pmsmtool.drive.port import Identity
+    from pmsmtool.drive_maps.drive_map import DriveMap
 
 
 HEARTBEAT_PERIODS = 1.2
@@ -26,16 +28,20 @@ PATIENCE_S = 1.0
 
 
 @click.command("info", epilog=examples("pmsmtool -i pmsmsim info", "pmsmtool -n 5 info --json | jq .identity.serial"))
+@map_option
 @bus_options
 @output_options
-def info_command(bus: BusOptions, out: Output) -> None:
+def info_command(bus: BusOptions, out: Output, map_file: Path | None) -> None:
     """Show identity, state, faults and parameter set of a drive."""
+    given = None if map_file is None else read_map(map_file)
     with open_node(bus, within_s=LOOKING_S) as node:
-        facts = read_facts(node)
+        facts = read_facts(node, given)
+        if given is not None:
+            warn_of_other_drive(node, out)
     out.result("info", facts, lambda: _lines(facts))
 
 
-def read_facts(node: DriveNode) -> dict[str, Any]:
+def read_facts(node: DriveNode, drive_map: DriveMap | None = None) -> dict[str, Any]:
     """Return what ``info`` shows, read from the drive; what it does not have is None."""
     from pmsmtool.cia402 import error_text, state_of
     from pmsmtool.drive import objects
@@ -59,7 +65,7 @@ def read_facts(node: DriveNode) -> dict[str, Any]:
         "supported_modes": _whole(node, objects.SUPPORTED_MODES),
         "parameter_set": _parameter_set(node),
         "configured": _moment(days, milliseconds),
-        "limits": _limits(node, identity),
+        "limits": _limits(node, identity, drive_map),
     }
 
 
@@ -81,13 +87,13 @@ def _parameter_set(node: DriveNode) -> dict[str, Any] | None:
     }
 
 
-def _limits(node: DriveNode, identity: Identity) -> dict[str, Any]:
+def _limits(node: DriveNode, identity: Identity, drive_map: DriveMap | None) -> dict[str, Any]:
     """Return rated current and largest speed: of the maker's own object where the map of the family names it."""
     from pmsmtool.drive import objects
     from pmsmtool.drive.motion_objects import rated_current
     from pmsmtool.measurement.capabilities import choose_map
 
-    node.map = choose_map(identity, None)
+    node.map = choose_map(identity, drive_map)
     stands = rated_current(node)
     held = None if stands is None else node.held(stands.item)
     rms = None if stands is None or held is None else stands.per_count * held / math.sqrt(2.0)

@@ -26,6 +26,7 @@ from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.eds import parse_eds
 from pmsmtool.drive_maps.map_tables import encode_table, look_up_words
 from pmsmtool.drive_maps.sheet_check import contradictions, family_of_sheet, limits_of, types_of, unnamed_sheet
+from pmsmtool.drive_maps.shipped_maps import nothing_to_write
 from pmsmtool.errors import ConfigError
 from pmsmtool.files import data_folder
 from pmsmtool.firmware.image import crc32, pack_image
@@ -236,7 +237,8 @@ def dcf_file(
 ) -> bytes:
     """Return a device configuration file (CiA 306-1).
 
-    Raises ConfigError: values that do not fit, or objects the base does not describe.
+    Raises ConfigError: values that do not fit, or objects the base does not describe; NotAvailable: the map has no
+    object for any value.
 
     Parameters
     ----------
@@ -272,6 +274,8 @@ def dcf_file(
             hint=f"give the EDS of the drive that the map is for, or {its}; nothing was written",
         )  # fmt: skip
     values = {drive_map.address(name): data for name, data in encoded.items()}
+    if not values:
+        raise nothing_to_write(drive_map, where)
     return new_dcf(base, values, node_id=node_id, node_name=wanted.name, where=where)
 
 

@@ -145,8 +145,9 @@ def _edits(
 ) -> tuple[dict[int, str], dict[int, str]]:
     """Return the lines to replace and the lines to insert behind others."""
     headers = [*sections_of(lines), (len(lines), "")]
+    names = dict(headers)
     replaced: dict[int, str] = {}
-    inserted: dict[int, str] = {}
+    placed: dict[Address, tuple[int, str] | None] = {}
     for (start, section), (end, _) in itertools.pairwise(headers):
         compact = section.endswith("value") and object_of(section[:-5])
         address = object_of(section)
@@ -156,17 +157,28 @@ def _edits(
             wanted = {str(sub): (index, sub) for index, sub in values if index == compact[0]}
         else:
             continue
+        last = max((n for n in range(start, end) if lines[n].strip()), default=start)
         for key, target in wanted.items():
-            if target not in values or (sheet.objects[target].line != start + 1 and not compact):
+            if target not in values or not (compact or names.get(sheet.objects[target].line - 1) == section):
                 continue
             name = "ParameterValue" if key == "parametervalue" else key
             new = value_text(sheet.objects[target].data_type, values[target])
             place = _line_of(lines, start + 1, end, key)
-            if place is not None:
+            if place is not None:  # in every section of that name, as the last one counts
                 replaced[place] = _with_value(lines[place], new)
+                placed[target] = None
             else:
-                last = max((n for n in range(start, end) if lines[n].strip()), default=start)
-                inserted[last] = inserted.get(last, "") + f"{name}={new}{newline}"
+                placed.setdefault(target, (last, f"{name}={new}{newline}"))
+    listed: dict[int, list[str]] = {}
+    for index, sub in sorted(values.keys() - placed.keys()):  # described by CompactSubObj, without a list of values
+        text = value_text(sheet.objects[index, sub].data_type, values[index, sub])
+        listed.setdefault(index, []).append(f"{sub}={text}{newline}")
+    inserted: dict[int, str] = {}
+    for last, line in filter(None, placed.values()):
+        inserted[last] = inserted.get(last, "") + line
+    for index, rows in listed.items():
+        head = f"{newline}[{index:04X}Value]{newline}NrOfEntries={len(rows)}{newline}"
+        inserted[len(lines) - 1] = inserted.get(len(lines) - 1, "") + head + "".join(rows)
     return replaced, inserted
 
 

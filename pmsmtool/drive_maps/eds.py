@@ -192,8 +192,11 @@ def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Ed
     objects: dict[tuple[int, int], EdsObject] = {}
     heads: dict[int, Section] = {}
     records: set[int] = set()
+    placed: dict[tuple[int, int | None], Section] = {}
     for section in sections.values():
         address = object_of(section.name)
+        if address is not None:
+            placed.setdefault(address, section)
         if address is not None and address[1] is None:
             heads[address[0]] = section
         elif address is not None and section.get("datatype"):
@@ -202,7 +205,9 @@ def parse_eds(data: bytes, where: str = "EDS", node_id: int | None = None) -> Ed
             warnings.append(f"{where}:{section.line}: [{section.name}] has a DataType and names no object, left out")
     for section in sections.values():
         for entry in _objects_of(section, sections, heads, records, node, where, warnings):
-            objects.setdefault((entry.index, entry.sub), entry)
+            described = placed.get((entry.index, entry.sub), section)
+            if described is section or not entry.sub:  # not by CompactSubObj what has a section of its own
+                objects.setdefault((entry.index, entry.sub), entry)
     if not objects:
         likely = next(
             (what for mark, what in OTHER_FILES.items() if data.lstrip(b"\xef\xbb\xbf \r\n").startswith(mark)), ""

@@ -10,7 +10,7 @@ from pmsmtool.data_types import DATA_TYPES
 from pmsmtool.drive_maps.drive_map import Cell, DriveMap, SignalCell
 from pmsmtool.drive_maps.eds import Eds, parse_integer
 from pmsmtool.drive_maps.motion_objects import MotionObject
-from pmsmtool.drive_maps.shipped_maps import GENERIC, family_of, load_family, unnamed_drive
+from pmsmtool.drive_maps.shipped_maps import GENERIC, family_of, load_family, only_family, unnamed_drive
 from pmsmtool.errors import ConfigError
 from pmsmtool.params.catalogue import OWN_SCALES
 
@@ -41,9 +41,13 @@ def identity_of_sheet(sheet: Eds) -> tuple[int, int]:
 def family_of_sheet(sheet: Eds) -> DriveMap | None:
     """Return the shipped map for the drive of a data sheet, None where there is none or the sheet does not say.
 
-    Where others have that identity, too, name or marks of the family must be in the sheet.
+    A sheet that leaves its product blank is of the only family of its vendor, if there is one alone. Where others have
+    that identity, too, name or marks of the family must be in the sheet.
     """
-    found = family_of(*identity_of_sheet(sheet))
+    vendor, product = identity_of_sheet(sheet)
+    found = family_of(vendor, product)
+    if found is None and not product:
+        found = only_family(vendor)
     if found is None or any(word.lower() in sheet.product_name.lower() for word in found.identity.names):
         return found
     return found if all((index, sub) in sheet.objects for index, sub, _ in found.identity.marks) else None

@@ -7,7 +7,7 @@ from difflib import get_close_matches
 
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, NotAvailable
 from pmsmtool.files import data_folder
 
 MAP_NAME = "map.toml"
@@ -42,6 +42,13 @@ def family_of(vendor: int, product: int) -> DriveMap | None:
     return next((drive_map for drive_map in maps if drive_map.is_for(vendor, product)), None)
 
 
+def only_family(vendor: int) -> DriveMap | None:
+    """Return the shipped map of a maker's drives where it is the only one of this vendor number, else None."""
+    maps = [load_family(name) for name in family_names()]
+    own = [one for one in maps if one.vendor == vendor != UNKNOWN_VENDOR]
+    return own[0] if len(own) == 1 else None
+
+
 def kin_of(vendor: int) -> str:
     """Return the families of other products of a maker, as a message names them; empty: there are none."""
     maps = [load_family(name) for name in family_names()]
@@ -61,3 +68,11 @@ def unnamed_drive(vendor: int, product: int, *, where: str, hint: str) -> Config
         likely=likely if kin else "a drive whose gains stand in no shipped map",
         hint=hint,
     )
+
+
+def nothing_to_write(drive_map: DriveMap, where: str) -> NotAvailable:
+    """Return the refusal of a set of which a map has no object for any value."""
+    return NotAvailable(
+        f"the map {drive_map.name!r} has no object for any value of the set on this drive", where=where,
+        hint="enter the values with the maker's software, or write the rows of your manual into a map",
+    )  # fmt: skip

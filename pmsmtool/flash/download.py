@@ -23,6 +23,7 @@ from pmsmtool.drive.drive_node import STORE_TIMEOUT_S, DriveNode, state_text
 from pmsmtool.drive.parameters import DriveParameters, Progress
 from pmsmtool.drive.port import Identity
 from pmsmtool.drive.stop import interrupts_deferred
+from pmsmtool.drive_maps.shipped_maps import nothing_to_write
 from pmsmtool.errors import (
     DriveTimeout,
     Interrupted,
@@ -225,12 +226,7 @@ class Download:
             As of :meth:`run`.
         """
         check_map(self.node.map, self.identity, self.folder)
-        if not self.plan.entries:  # storing would keep what others left in it, for nothing
-            raise NotAvailable(
-                f"the map {self.node.map.name!r} has no object for any value of the set on this drive",
-                where=f"node {self.node.node}",
-                hint="enter the values with the maker's software, or write the rows of your manual into a map",
-            )
+        refuse_empty(self.node, self.plan)  # storing would keep what others left in it, for nothing
         if store is not False and self.has_work(store=store) and not self.node.can_store():
             raise NotAvailable(
                 NO_STORE, where=f"node {self.node.node}",
@@ -523,6 +519,12 @@ def check_identity(node: DriveNode, expected: Identity) -> None:
             likely="drives were swapped, or two share this node id",
             hint="check the node id; nothing was written to this drive",
         )
+
+
+def refuse_empty(node: DriveNode, plan: Plan) -> None:
+    """Raise NotAvailable: the plan has no entry."""
+    if not plan.entries:
+        raise nothing_to_write(node.map, f"node {node.node}")
 
 
 def refuse_while_enabled(node: DriveNode) -> None:

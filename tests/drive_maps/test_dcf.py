@@ -119,6 +119,35 @@ def test_update_changes_only_the_values() -> None:
         dcf.values_of(odd)
 
 
+VARIABLE = "[{}]\nParameterName=x\nObjectType=7\nDataType=6\nAccessType=rw\n"
+COMPACT = VARIABLE.format("3210").replace("ObjectType=7", "ObjectType=8") + "DefaultValue=1\nCompactSubObj=4\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "added"),
+    [
+        (VARIABLE.format("3210sub2") * 2 + "ParameterValue=7\n", 0),
+        (VARIABLE.format("3210sub2") + "ParameterValue=5\n" + VARIABLE.format("3210sub02") + "ParameterValue=7\n", 0),
+        (COMPACT, 4),
+        (COMPACT + "[3210Value]\nNrOfEntries=0\n", 1),
+        (COMPACT + VARIABLE.format("3210sub02").replace("=6", "=3"), 1),
+    ],
+    ids=[
+        "section twice",
+        "in two spellings",
+        "compact without a list",
+        "with an empty list",
+        "with a section of its own",
+    ],
+)
+def test_what_is_laid_into_a_file_is_what_the_file_holds(text: str, added: int) -> None:
+    """The old value of a later section counted on, and one of a compact object was left out without a word."""
+    new = dcf.update_dcf(text.encode(), {(0x3210, 2): b"\x09\0"})
+    assert dcf.values_of(eds.parse_eds(new)) == {(0x3210, 2): b"\x09\0"}
+    assert new.count(b"\n") == text.count("\n") + added
+    assert eds.parse_eds(new).objects[0x3210, 2].data_type == (3 if "=3\n" in text else 6)
+
+
 def test_crlf_files_stay_crlf() -> None:
     sheet = SHEET.replace(b"\n", b"\r\n")
     new = dcf.new_dcf(sheet, {(0x2010, 1): b"\x02"}, node_id=7)

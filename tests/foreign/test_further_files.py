@@ -8,11 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from pmsmtool.drive_maps.drive_map_file import dump_drive_map
+from pmsmtool.drive_maps.eds import parse_eds
+from pmsmtool.drive_maps.sheet_check import family_of_sheet
+from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import ConfigError
 from pmsmtool.machine.machine_file import machine_path
 from pmsmtool.sim.foreign.file_rows import read_makers_objects
 from tests.cli.conftest import Tool
-from tests.foreign.data_sheets import Row, epos4, unknown, write_eds
+from tests.foreign.data_sheets import COMMON, HEARTBEAT, TORQUE, Row, copley, epos4, identity, unknown, write_eds
 from tests.foreign.test_foreign_drive import opened
 
 
@@ -160,3 +164,41 @@ def test_a_current_beyond_what_the_drive_shows_is_not_asked_for(tool: Tool) -> N
     assert code == 5 and "ends at 46.34 Apk" in said and "supervision tested" not in said, said
     code, _, said = tool("move", "--by", "90deg", *drive)
     assert code == 0 and "current   at most 46.34 Apk" in said, said
+
+
+def test_a_file_without_a_product_is_of_the_only_family_of_its_vendor(tmp_path: Path) -> None:
+    """Copley's own EDS leaves it blank: `caps` took the family's map, `export dcf --into` that of no drive."""
+    for rows, family in ((copley(), "copley"), (epos4(), None)):  # maxon has two families
+        blank = tuple(("" if row[:2] == (0x1018, 2) else row[4]) for row in rows)
+        path = write_eds(tmp_path / "x.eds", [(*row[:4], value) for row, value in zip(rows, blank, strict=True)])
+        found = family_of_sheet(parse_eds(path.read_bytes()))
+        assert (found and found.name) == family
+    other = write_eds(tmp_path / "y.eds", (*unknown(without=(0x1018,)), *identity(0xAB, 0)))
+    assert family_of_sheet(parse_eds(other.read_bytes())) is None, "another maker with that number"
+
+
+@pytest.mark.chain
+def test_a_set_of_which_a_map_holds_nothing_is_no_equal_drive_and_no_file(tool: Tool) -> None:
+    """ "0 of 0 objects change", exit code 0, said `flash-params --check`, and `export` wrote the file as it was."""
+    write_eds(Path("x.eds"), (*COMMON, *HEARTBEAT, *TORQUE, *identity(0x9A, 0), (0x6502, 0, "U32", "ro", "0x20d")))
+    tool("tune", str(machine_path("interior-2k2")), "-o", "design.toml")
+    on = ("--sim", "interior-2k2?nv=:memory:&eds=x.eds")
+    for words in (
+        (*on, "flash-params", "design.toml", "--check"), (*on, "flash-params", "design.toml", "--dry-run"),
+        ("export", "dcf", "design.toml", "--into", "x.eds", "-o", "new.dcf"),
+    ):  # fmt: skip
+        code, _, said = tool(*words)
+        assert code == 9 and "no object for any value of the set" in said, words
+    assert not Path("new.dcf").exists()
+
+
+@pytest.mark.chain
+def test_info_reads_the_rated_current_by_the_map_that_is_given(tool: Tool) -> None:
+    """A map that says rms was of no use to it."""
+    write_eds(Path("x.eds"), epos4())
+    text = dump_drive_map(load_family("epos4"))
+    Path("own.toml").write_text(text.replace("mA peak-or-rms", "mA rms"), encoding="utf-8")
+    on = ("--sim", "interior-2k2?nv=:memory:&eds=x.eds", "info", "--json")
+    undecided, decided = (json.loads(tool(*on, *more)[1])["limits"] for more in ((), ("--map", "own.toml")))
+    assert undecided["rated_current_arms"] is None
+    assert decided["rated_current_arms"] == pytest.approx(undecided["rated_current_a"])
