@@ -5,7 +5,8 @@
 
 What the output counts may be unknown: over the error it still gives K_i / K_p, which no resistance, dead time or EMF
 touches. K_p over the inductance then comes from how the current follows. What the EMF does there is a nuisance: a
-constant, and a part that grows with the sum of the current (the shaft turns freely).
+constant, and a part that grows with the sum of the current (the shaft turns freely). What the inverter's dead time does
+there goes on for many periods: a fit of what it leaves as an autoregression takes it out (generalised least squares).
 """
 
 from __future__ import annotations
@@ -26,6 +27,12 @@ FIRST_BANDWIDTH = (0.04, 0.12, 0.3)
 """K_p / L times period that a fit begins with: makers leave 0.08 to 0.3 (``learned_gains.CURRENT_BANDWIDTH``)."""
 SPAN = (1e-3, 1.2)
 """Of K_p / L times period: less is no current loop, more is unstable."""
+LEFT_ORDER = 8
+"""Order of the autoregression of what a fit leaves. With a dead time of 1.4 times R I_nom the standard deviation of K_p
+fell from 2.9 to 0.8 %."""
+UNFILTERED = np.ones(1)
+WHITE_FLOOR = 1e-6
+"""White noise of what a fit leaves (variance, relative), so that a record without noise has a filter."""
 RESISTANCES = (0.3, 4.0)
 """Of the resistance stated: a winding may be warmer by half, and dead time adds to it at small currents."""
 
@@ -51,6 +58,10 @@ class Winding:
     """Inductance in q, and its standard deviation (relative)."""
     R_ohm: float
     """Resistance, from which a fit begins."""
+    U_max_v: float = math.inf
+    """Largest voltage that the inverter has for it (V peak): U_dc / sqrt(3)."""
+    emf_vs_per_rad: float = 0.0
+    """Voltage that the turning shaft takes of it, per speed of the shaft (V s/rad)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +91,11 @@ def fit_current_loop(
     rate, left = integral_rate(records)
     delays = DELAYS if first is None else (first.delay,)
     found = [_followed(records, rate, winding, delay, first) for delay in delays]
-    best = replace(min(found, key=lambda loop: loop.misfit), output_misfit=left)
-    of_gain = _spread([_followed([record], rate, winding, best.delay, best).K_p_per_L for record in records])
+    raw = min(found, key=lambda loop: loop.misfit)
+    white = _autoregression([_unexplained(record, raw, UNFILTERED) for record in records])
+    found = [_followed(records, rate, winding, delay, raw, white) for delay in delays]
+    best = replace(min(found, key=lambda loop: loop.misfit), misfit=raw.misfit, output_misfit=left)
+    of_gain = _spread([_followed([record], rate, winding, best.delay, best, white).K_p_per_L for record in records])
     of_rate = _spread([integral_rate([record])[0] for record in records])
     return replace(best, std=(of_gain, math.hypot(of_gain, of_rate), of_rate))
 
@@ -120,10 +134,24 @@ def integral_rate(records: Sequence[CurrentSteps]) -> tuple[float, float]:
     return (float(K_i / K_p) if K_p else 0.0), left
 
 
+def _autoregression(left: Sequence[Array]) -> Array:
+    """Return the filter that makes noise without memory of what a fit leaves (Yule-Walker)."""
+    from scipy.linalg import solve_toeplitz
+
+    r = [sum(float(x[: len(x) - k] @ x[k:]) for x in left) for k in range(LEFT_ORDER + 1)]
+    if r[0] <= 0.0:
+        return UNFILTERED
+    return np.concatenate([[1.0], -solve_toeplitz([(1.0 + WHITE_FLOOR) * r[0], *r[1:-1]], r[1:])])
+
+
 def _followed(
-    records: Sequence[CurrentSteps], rate: float, winding: Winding, delay: float, first: CurrentLoop | None
-) -> CurrentLoop:
-    """Return the loop of this delay and K_i / K_p (1/s) that follows what is asked best."""
+    records: Sequence[CurrentSteps], rate: float, winding: Winding, delay: float, first: CurrentLoop | None,
+    white: Array = UNFILTERED,
+) -> CurrentLoop:  # fmt: skip
+    """Return the loop of this delay and K_i / K_p (1/s) that follows what is asked best.
+
+    ``white`` filters what it leaves before that is weighed.
+    """
     from scipy.optimize import least_squares
 
     period_s = records[0].period_s
@@ -131,7 +159,8 @@ def _followed(
 
     def left(point: Array) -> Array:
         K_p, corner = (math.exp(x) for x in point)
-        return np.concatenate([_unexplained(record, K_p, K_p * rate, corner, delay) for record in records])
+        loop = CurrentLoop(K_p, rate, delay, 0.0, corner=corner)
+        return np.concatenate([_unexplained(record, loop, white) for record in records])
 
     corner = winding.R_ohm / winding.L_h
     low, high = (np.log([share / period_s, of_R * corner]) for share, of_R in zip(SPAN, RESISTANCES, strict=True))
@@ -142,11 +171,12 @@ def _followed(
     return CurrentLoop(K_p, rate, delay, math.sqrt(2.0 * best.cost) / max(moved, 1e-12), corner=corner)
 
 
-def _unexplained(record: CurrentSteps, K_p: float, K_i: float, corner: float, delay: float) -> Array:
-    """Return what the loop leaves of the current, once the nuisances are fitted; gains over the inductance."""
+def _unexplained(record: CurrentSteps, of: CurrentLoop, white: Array) -> Array:
+    """Return what the loop leaves of the current, filtered, once the nuisances are fitted."""
     from scipy.signal import lfilter
 
-    T = record.period_s
+    T, K_p, K_i = record.period_s, of.K_p_per_L, of.K_p_per_L * of.rate_per_s
+    corner, delay = of.corner, of.delay
     a = math.exp(-corner * T)
     b = (1.0 - a) / corner
     whole = int(delay)
@@ -165,5 +195,6 @@ def _unexplained(record: CurrentSteps, K_p: float, K_i: float, corner: float, de
         lfilter(plant, closed, np.cumsum(record.current_a)),
     ])  # fmt: skip
     target = record.current_a - base - lfilter(loop, closed, record.asked_a - base)
+    columns, target = (lfilter(white, 1.0, x, axis=0)[len(white) - 1 :] for x in (columns, target))
     columns /= np.linalg.norm(columns, axis=0)
     return np.asarray(target - columns @ np.linalg.lstsq(columns, target, rcond=None)[0])

@@ -49,7 +49,6 @@ from pmsmtool.measurement.learn_gains import (
     LEAST_MARGIN_DOWN_RAD,
     LEAST_MARGIN_RAD,
     SETTLE_S,
-    TICK_S,
     TRIP,
 )
 
@@ -59,12 +58,25 @@ OUTPUTS = (UNSCALED, "u_q_v")
 """Output of the q current loop, whatever it counts."""
 SLOWEST_S = 1.0 / 4000.0
 """Longest time between two samples: slower ones do not show a current loop."""
-BIAS, STEP = 0.4, 0.3
-"""Current of ramp and step, of what the drive may carry: it keeps its sign, so that no dead time is in the step."""
-LEAD_TICKS, EARLY_TICKS, HALF_TICKS = 10, 3, 2
-"""Ticks of the ramp before the record, of them those that starting the recorder takes, and of half a square wave."""
-RECORDS = 6
-"""Records of one setting."""
+TICK_S = 0.003
+"""Time between two references of the speed: some time constants of a current loop."""
+LEVELS = (0.15, 0.425, 0.7, 0.425)
+"""Currents that are asked for, a tick each, of what the drive may carry: they keep their sign, so that no dead time is
+in a step."""
+STEP = LEVELS[1] - LEVELS[0]
+LEAD_TICKS = 14
+"""Ticks of even current before the recorder is started: the speed loop settles."""
+START_TICKS = 7
+"""Ticks that starting the recorder takes at most."""
+VOLTAGE_SHARE = 0.8
+"""What a step may take of the voltage that EMF and resistance leave. A step that reaches the limit lacks some voltage
+for a few periods: K_p came out 4.5 % too small."""
+RECORDS = 10
+"""Records of one setting; of steps of half the size twice as many, as what the output is counted in is as large."""
+UNEVEN = 0.1
+"""By how much the records of one setting differ in size, so that what counts round off differs, too."""
+SETTINGS = math.sqrt(2.0)
+"""A scale is the mean of two settings or three: so much smaller than of one is what single records leave of it."""
 FASTER = 4.0
 """Bandwidth of the current loop, over that of the speed loop, below which no gain is lowered."""
 PLANT_PERIODS = 0.5
@@ -202,6 +214,7 @@ class _CurrentLearner:
         self.guard, self.drive, self.recorder, self.put, self.say = guard, drive, recorder, put, say
         self.speed_loop, self.winding = speed_loop, winding
         self.notes: list[str] = []
+        self.size = 1.0
         self.signals = recorded_signals(recorder)
         self.rows = recorder.room(self.signals)
         self.period_s = recorder.period_s
@@ -210,6 +223,9 @@ class _CurrentLearner:
         """Measure everything."""
         counts = {CURRENT_GAIN: gain.counts, CURRENT_INTEGRAL: integral.counts}
         own, loop = self._observe("with the drive's own gains", 1.0, counts)
+        self.size = self._within_voltage(loop)
+        if self.size < 1.0:
+            own, loop = self._observe(f"with {self.size:.2f} of the steps, for the voltage's limit", 1.0, counts)
         self.drive.oscillation.limit_a = TRIP * max(self.drive.oscillation.largest_a, self.drive.current_count_a)
         half, _ = self._observe("with steps of half the size", 0.5, counts, loop)
         gain_changed = self._changed(gain, DOWN, loop, (DOWN, DOWN), counts)
@@ -217,25 +233,34 @@ class _CurrentLearner:
         found = () if integral_changed is None else (integral_changed,)
         return LearnedCurrentLoop((own, half), gain_changed, found, tuple(self.notes))
 
+    def _largest_a(self) -> float:
+        """Return the current of which the levels are shares."""
+        return min(self.guard.envelope.i_max_apk, self.drive.current_limit_apk, self.drive.rated_apk)
+
+    def _within_voltage(self, loop: CurrentLoop) -> float:
+        """Return the size of the steps at which the loop does not reach its voltage limit."""
+        winding, largest = self.winding, self._largest_a()
+        emf = winding.emf_vs_per_rad * HIGH_SHARE * self.guard.envelope.speed_max_rad_s
+        left = VOLTAGE_SHARE * (winding.U_max_v - emf - winding.R_ohm * max(LEVELS) * largest)
+        return min(1.0, max(0.0, left) / (loop.K_p_per_L * winding.L_h * STEP * largest))
+
     def _record(self, size: float) -> CurrentSteps:
-        """Record the current while the speed rises through zero, with a square wave on it."""
+        """Record the current while the speed rises through zero, in steps of the asked current."""
         guard, drive, loop = self.guard, self.drive, self.speed_loop
         limit = guard.envelope.speed_max_rad_s
-        record_ticks = math.ceil(self.rows * self.period_s / TICK_S) + 1
-        current = size * min(guard.envelope.i_max_apk, drive.current_limit_apk, drive.rated_apk)
-        per_ampere = 1.0 / abs(loop.amps_per_rad_s2)
-        tick = BIAS * current * per_ampere * TICK_S
-        jump, step = BIAS * current * per_ampere / loop.K_p_per_J, STEP * current * per_ampere / loop.K_p_per_J
-        way = jump + step + tick * (LEAD_TICKS + record_ticks)
-        share = min(1.0, 2.0 * HIGH_SHARE * limit / way)
-        low = -0.5 * share * way
-        speeds = []
-        for k in range(LEAD_TICKS + record_ticks):
-            high = k >= LEAD_TICKS and (k - LEAD_TICKS) // HALF_TICKS % 2 == 0
-            speeds.append(low + share * (jump + tick * k + (step if high else 0.0)))
+        ticks = LEAD_TICKS + START_TICKS + math.ceil(self.rows * self.period_s / TICK_S)
+        per_ampere = size * self.size * self._largest_a() / abs(loop.amps_per_rad_s2)
+        speeds, free = [], 0.0
+        for k in range(ticks):
+            asked = per_ampere * LEVELS[(max(k, LEAD_TICKS) - LEAD_TICKS + 1) % len(LEVELS)]
+            speeds.append(free + asked / loop.K_p_per_J)
+            free += asked * TICK_S
+        share = min(1.0, 2.0 * HIGH_SHARE * limit / max(speeds))
+        low = -0.5 * share * max(speeds)
+        speeds = [low + share * speed for speed in speeds]
         guard.command_speed(low)
         guard.wait(SETTLE_S)
-        drive.starts_s = (LEAD_TICKS - EARLY_TICKS) * TICK_S
+        drive.starts_s = LEAD_TICKS * TICK_S
         drive.starts = lambda: self.recorder.arm(self.signals, self.rows, 1, 0, at_excitation=False)
         hold = round(TICK_S / drive.period_s)
         excitation = Excitation(Shape.BUFFER, Injection.SPEED, 0.0, hold_periods=hold, buffer=speeds)
@@ -248,7 +273,8 @@ class _CurrentLearner:
     def _observe(
         self, what: str, size: float, counts: dict[str, float], first: CurrentLoop | None = None
     ) -> tuple[Observation, CurrentLoop]:
-        records = [self._record(size) for _ in range(RECORDS)]
+        count = round(RECORDS / size)
+        records = [self._record(size * (1.0 - UNEVEN * k / count)) for k in range(count)]
         self.guard.quick_stop()  # a fit takes longer than the drive waits for a heartbeat
         found = fit_current_loop(records, self.winding, first)
         lag_s = (found.delay + PLANT_PERIODS) * self.period_s
@@ -259,7 +285,9 @@ class _CurrentLearner:
             f"{100 * found.output_misfit:.2g} %"
         )
         self.guard.enable()
-        seen = Observation(counts[CURRENT_GAIN], counts[CURRENT_INTEGRAL], loop, 1.0, found.std, None, 1.0)
+        of_gain, of_integral, of_rate = (std / SETTINGS for std in found.std)
+        std = of_gain, of_integral, of_rate
+        seen = Observation(counts[CURRENT_GAIN], counts[CURRENT_INTEGRAL], loop, 1.0, std, None, 1.0)
         return seen, found
 
     def _changed(

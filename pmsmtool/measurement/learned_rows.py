@@ -154,8 +154,11 @@ def emf_of(file: MachineFile) -> Emf:
 
 def winding_of(file: MachineFile) -> Winding:
     """Return what a current loop acts on."""
-    L = file.machine.L_q_h
-    return Winding(L, _relative(file, "L_q_h", L, L_STD), file.machine.R_s_ohm)
+    machine, L = file.machine, file.machine.L_q_h
+    return Winding(
+        L, _relative(file, "L_q_h", L, L_STD), machine.R_s_ohm, file.inverter.U_dc_v / math.sqrt(3.0),
+        machine.pole_pairs * machine.psi_f_wb,
+    )  # fmt: skip
 
 
 def learned_gains(file: MachineFile, measured: LearnedLoop) -> dict[str, Learned]:

@@ -30,7 +30,9 @@ K_P_TOL, RATE_TOL = 0.015, 0.015
 P, I = "current.K_p_q_v_per_a", "current.K_i_q_v_per_as"  # noqa: E741
 
 
-def record(K_p: float, K_i: float, size: float = 1.0, seed: int = 0, dead_v: float = 0.0) -> CurrentSteps:
+def record(
+    K_p: float, K_i: float, size: float = 1.0, seed: int = 0, dead_v: float = 0.0, turns: bool = False
+) -> CurrentSteps:
     """Simulate a loop whose voltage acts in the period after its sample, on a shaft that is accelerated."""
     from scipy.linalg import expm
 
@@ -52,7 +54,9 @@ def record(K_p: float, K_i: float, size: float = 1.0, seed: int = 0, dead_v: flo
         out[k] = current, u
         integral += T * K_i * error
         state[2] = waiting
-        state[3] = dead_v * (1.0 if (k // 55) % 2 else -1.0)  # what a dead time takes as the phases change sign
+        state[3] = dead_v * (
+            1.0 if ((k + 31 * seed * turns) // 55) % 2 else -1.0
+        )  # what a dead time takes as the phases change sign
         waiting = u
         state = step @ state
     current, u = out.T
@@ -116,7 +120,17 @@ def test_a_gain_whose_inductance_is_not_known_or_whose_loop_is_disturbed_stays_u
     gain, integral = learned("time", L_std=0.05)
     assert gain.scale is None and "too wide" in gain.why and integral.scale is not None
     gain, integral = learned("time", dead_v=1.0)
-    assert gain.scale is None and integral.scale is None and "exponent" in gain.why
+    assert gain.scale is None and gain.why
+    assert integral.scale == pytest.approx(1.0 / RATE / INTEGRAL, rel=RATE_TOL), "the output does not see it"
+
+
+@pytest.mark.chain
+def test_a_dead_time_whose_sign_changes_anywhere_in_a_record_leaves_the_gain() -> None:
+    """Without the autoregression K_p was 6.0 % too large with a standard deviation of 12 %; it is 0.7 and 1.6 %."""
+    records = [record(K_P, K_P * RATE, 1.0, seed, 0.4, True) for seed in range(6)]
+    found = fit_current_loop(records, Winding(L, 0.005, R))
+    assert found.delay == 1.0 and found.K_p_per_L == pytest.approx(K_P / L, rel=K_P_TOL)
+    assert found.std[0] < 0.025
 
 
 def test_one_record_shows_no_spread() -> None:
