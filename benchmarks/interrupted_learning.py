@@ -7,6 +7,10 @@ Drives and gains are those of ``learned_gains.py``, moments and ways those of ``
 *error* is one that nobody expects. Half of the moments lie at, before or after a frame by which the tool writes an
 object, half anywhere. The answer of every fit is the truth, for what is asked here is not accuracy.
 
+A drive's second run is copied at each of its moments (``os.fork``: drive, tool and clock are one process without
+threads). The copy is interrupted and looked at, and its files are taken back; the run goes on. So a moment costs what
+follows it, and not what was before.
+
 Wanted: the drive off, no speed beyond the limit, and the drive's own gains: at once where tool and bus live, else after
 the next command, which says so. Exit code 130 after Ctrl-C, 8 where the adapter went while the drive was energised;
 where a gain was changed then, it is said how it comes back.
@@ -19,13 +23,21 @@ from __future__ import annotations
 import argparse
 import contextlib
 import multiprocessing
+import os
+import pickle
 import random
+import shutil
 import signal
 import sys
+import tempfile
+import traceback
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import can
 
 from benchmarks.commissioning import commanded, powered, prepared
 from benchmarks.interrupted_commands import KILLED, MEMORY_WAIT_S, OWN_STOP_S, TO_DO, Watch
@@ -39,6 +51,7 @@ from pmsmtool.measurement import learn_current_gains, learn_gains, learn_positio
 from pmsmtool.measurement.changed_gains import BACK, GAIN, INTEGRAL
 from pmsmtool.measurement.learn_current_gains import CURRENT_GAIN
 from pmsmtool.sim.bus import PmsmSimBus
+from pmsmtool.sim.foreign.drawn_gains import ACCELERATION_OBJECT
 from pmsmtool.sim.simulated_machine import settings_of
 from pmsmtool.units import rad_s_from_rpm
 
@@ -61,8 +74,61 @@ class Learning:
     fastest: float
 
 
-def learning(table: str, seed: int, how: str, moment: int | None) -> Learning:
-    """Run `map learn` on a seed's drive and interrupt it at the n-th frame; ``None``: a whole run."""
+class CopiedWatch(Watch):
+    """A watch whose process is copied at given frames; every copy is interrupted there, this process never.
+
+    Parameters
+    ----------
+    line : PmsmSimBus
+        A member of the line that stays.
+    due : sequence of (int, str)
+        Frame, and what happens there.
+    """
+
+    def __init__(self, line: PmsmSimBus, due: Sequence[tuple[int, str]]) -> None:
+        super().__init__("none", None, line)
+        self.due = list(due)
+        self.answer: Path | None = None
+        """Where a copy leaves what it found; None: this is no copy."""
+        self.found: list[tuple[int, str, Learning]] = []
+
+    def passes(self, frame: can.Message) -> None:
+        """Let copies go on from here, each interrupted by this frame."""
+        for at, how in [one for one in self.due if one[0] == self.frames + 1]:
+            self._copy(at, how)
+        super().passes(frame)
+
+    def _copy(self, at: int, how: str) -> None:
+        if self.answer is not None:
+            return
+        outside = Path(tempfile.mkdtemp())  # taken away by hand: a copy leaves no block behind it
+        shutil.copytree(Path.cwd(), outside / "kept")
+        process = os.fork()
+        if not process:
+            self.answer, self.how, self.moment = outside / "answer", how, at
+            return
+        os.waitpid(process, 0)
+        for entry in Path.cwd().iterdir():
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+        shutil.copytree(outside / "kept", Path.cwd(), dirs_exist_ok=True)
+        self.found.append((at, how, pickle.loads((outside / "answer").read_bytes())))
+        shutil.rmtree(outside)
+
+    def leave(self, found: Learning) -> None:
+        """End a copy with what it found."""
+        if self.answer is not None:
+            self.answer.write_bytes(pickle.dumps(found))
+            os._exit(0)
+
+    def failed(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """End a copy with what it failed by, before the folder of both goes."""
+        if error is not None:
+            told = "".join(traceback.format_exception(error))
+            self.leave(Learning(self.frames, (), 70, f"the benchmark failed: {told[-400:]}", False, 0.0))
+
+
+def learning(table: str, seed: int, due: Sequence[tuple[int, str]] = ()) -> tuple[Learning, CopiedWatch]:
+    """Run `map learn` on a seed's drive, with copies that are interrupted at their frames."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(prepared())
         channel = stack.enter_context(machine_at(seed, table, FAMILIES[seed % len(FAMILIES)]))
@@ -80,6 +146,8 @@ def learning(table: str, seed: int, how: str, moment: int | None) -> Learning:
 
         def counts() -> list[bytes]:
             places = [face.gains.gain, face.gains.integral, face.gains.position, face.gains.forward]
+            if face.gains.acceleration_ff_s:
+                places.append(ACCELERATION_OBJECT)
             if face.gains.current is not None:
                 places += [face.gains.current.gain, face.gains.current.integral]
             return [face.behind.dictionary.find(*place).value for place in places if place is not None]
@@ -88,7 +156,8 @@ def learning(table: str, seed: int, how: str, moment: int | None) -> Learning:
             stack.callback(setattr, module, name, getattr(module, name))
             setattr(module, name, value)
         before = counts()
-        watch = Watch(how, moment, line)
+        watch = CopiedWatch(line, due)
+        stack.push(watch.failed)
         fastest = 0.0
 
         def look() -> None:
@@ -107,7 +176,7 @@ def learning(table: str, seed: int, how: str, moment: int | None) -> Learning:
             names.append(CURRENT_GAIN)
         with watch.on():
             code, told = commanded("map", "learn", *names, "--machine", "told.toml", *on)
-            watch.over = True
+            watch.over, how = True, watch.how
             alive = how in ("ctrl-c", "error") or (how == "freeze" and not watch.enabled)
             if how == "kill" and watch.happened:
                 code, told = KILLED, "nothing"
@@ -139,8 +208,10 @@ def learning(table: str, seed: int, how: str, moment: int | None) -> Learning:
             wrong.append("NOT OFF")
         if fastest > 1.0:
             wrong.append(f"OVER-SPEED {fastest:.2f} of the limit")
-    verdict = "; ".join(wrong) or ("gains back by the next command" if changed else "gains as before")
-    return Learning(watch.frames, tuple(watch.written_at), code, verdict, not wrong, fastest)
+        verdict = "; ".join(wrong) or ("gains back by the next command" if changed else "gains as before")
+        found = Learning(watch.frames, tuple(watch.written_at), code, verdict, not wrong, fastest)
+        watch.leave(found)
+    return found, watch
 
 
 def held_off(line: PmsmSimBus) -> bool:
@@ -152,14 +223,15 @@ def held_off(line: PmsmSimBus) -> bool:
 def learn_one(job: tuple[str, int, int]) -> list[tuple[str, int, str, Learning]]:
     """Interrupt the run of one seed at drawn moments; the first is the whole run."""
     table, seed, moments = job
-    whole = learning(table, seed, "none", None)
-    found = [(FAMILIES[seed % len(FAMILIES)], 0, "whole run", whole)]
+    family = FAMILIES[seed % len(FAMILIES)]
+    whole, _ = learning(table, seed)
     chance = random.Random(f"interrupt {seed}")
+    due = []
     for number in range(moments):
         at = chance.choice(whole.written) + chance.choice((-1, 0, 1)) if number % 2 else chance.randint(1, whole.frames)
-        how = chance.choice(LEARN_WAYS)
-        found.append((found[0][0], at, how, learning(table, seed, how, at)))
-    return found
+        due.append((at, chance.choice(LEARN_WAYS)))
+    _, watch = learning(table, seed, due)
+    return [(family, 0, "whole run", whole), *((family, *found) for found in watch.found)]
 
 
 def interrupt(options: argparse.Namespace) -> int:
