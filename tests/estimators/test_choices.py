@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.estimators.least_squares import Fit
 from pmsmtool.estimators.shaft import frequency_response as fr
 from pmsmtool.estimators.shaft import mechanics, response_lines
+from pmsmtool.estimators.shaft.disturbances import Disturbances, Extent
 from pmsmtool.estimators.shaft.model import Run
 from pmsmtool.identification import swing
 from pmsmtool.machine.parameters import Estimate
@@ -113,7 +115,7 @@ def _fit(x: Sequence[float]) -> Fit:
 
 
 def test_cogging_is_taken_along_with_the_inertia_of_the_fit_before(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is known as an acceleration; what a fit says beyond shaft and states is not kept for the next."""
+    """And with orders that its residual shows; what it says beyond shaft and states is not kept for the next."""
     t = 1e-2 * np.arange(101.0)
     traces = [
         trace_of(t, {"coasting": k % 2 == 1}, theta_M_rad=0.01 * np.floor(1e2 * (t + t * t)), flagged=0.0 * t)
@@ -124,6 +126,7 @@ def test_cogging_is_taken_along_with_the_inertia_of_the_fit_before(monkeypatch: 
     begun, first = np.array([math.log(2e-3), 1e-3, 0.05, *range(8)]), [math.log(3e-3), 2e-3, 0.06]
     states = [10.0 + k for k in range(8)]
     inertias: list[float] = []
+    orders: list[Sequence[int]] = []
     starts: list[list[float]] = []
 
     def blocks(run: Trace, *given: Any) -> tuple[Array, Run]:
@@ -133,34 +136,39 @@ def test_cogging_is_taken_along_with_the_inertia_of_the_fit_before(monkeypatch: 
 
     def fit(runs: Sequence[Run], start: Array, elastic: bool) -> tuple[Fit, float, Sequence[Run]]:
         starts.append(start.tolist())
-        return _fit([*first, 7.0, 8.0, 9.0, *states]), 1.0, runs
+        return _fit([*first, 7.0, 8.0, 9.0, *states]), 1.0, [replace(run, torque_std=1e-2) for run in runs]
+
+    def shapes(theta: Array, torque: Array, T: float, extent: Extent, pole_pairs: int) -> Disturbances:
+        orders.append(extent.orders)
+        return one.disturbances
+
+    def enough(runs: Sequence[Run], residual: Array, *, slow: bool) -> Sequence[Run]:
+        assert slow and runs[0].torque_std == 1e-2
+        raise Enough
 
     class Enough(Exception):
         pass
 
-    def explained(fitted: Any, runs: Sequence[Trace]) -> Any:
-        fitted(runs)
-        raise Enough
-
     for name, value in (
-        ("angle_harmonics", lambda *_: cogging), ("_blocks", blocks), ("disturbances", lambda *_: one.disturbances),
-        ("_start", lambda _: begun), ("_fit", fit), ("_explained", explained),
+        ("angle_harmonics", lambda *_: cogging), ("_blocks", blocks), ("disturbances", shapes), ("noisier", enough),
+        ("_start", lambda _: begun), ("_fit", fit), ("cogging_orders", lambda runs, fit: [9, 4]),
     ):  # fmt: skip
         monkeypatch.setattr(mechanics, name, value)
     with pytest.raises(Enough):
         mechanics.estimate_mechanics(traces, lambda d, q: q, 1.0, 0.01, 0.02)
-    assert inertias == pytest.approx([0.0] * 4 + [2e-3] * 4 + [3e-3] * 4)
-    assert starts == [begun.tolist(), [*first, *states]]
+    assert inertias == pytest.approx([0.0] * 4 + [2e-3] * 4 + [3e-3] * 8)
+    assert starts == [begun.tolist(), [*first, *states], [*first, *states]]
+    assert orders == [()] * 12 + [[9, 4]] * 4, "what the residual of a fit shows is in the next"
 
 
 def test_noise_of_the_torque_is_refused_beyond_its_limit_unless_it_is_expected(monkeypatch: pytest.MonkeyPatch) -> None:
     run = Run(np.linspace(0.0, 1.0, 101), np.full(100, 0.5), 4e-3, np.full(101, 1e-4), 1e-4, False)
     found = _fit([0.0] * 6)
     monkeypatch.setattr(mechanics, "_minimum", lambda *_: found)
-    monkeypatch.setattr(mechanics, "_noisier", lambda runs, *_: runs)
+    monkeypatch.setattr(mechanics, "noisier", lambda runs, *_, **__: runs)
 
     def fitted(noise: float, *, elastic: bool) -> Fit:
-        monkeypatch.setattr(mechanics, "_noise", lambda _: {False: noise, True: 0.0})
+        monkeypatch.setattr(mechanics, "torque_noise", lambda _: {False: noise, True: 0.0})
         return mechanics._fit([run], np.zeros(5), elastic)[0]
 
     assert fitted(mechanics.RIPPLE_MOST, elastic=False) is found and fitted(0.2, elastic=True) is found

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.fft import idct
 from scipy.signal import dlsim
 
 from pmsmtool.arrays import Array, Complex
@@ -20,8 +21,8 @@ from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, SensorTolerance
 from pmsmtool.estimators.least_squares import Fit
 from pmsmtool.estimators.shaft import frequency_response as fr
-from pmsmtool.estimators.shaft import mechanics, position, response_lines
-from pmsmtool.estimators.shaft.disturbances import Disturbances
+from pmsmtool.estimators.shaft import mechanics, model, position, response_lines
+from pmsmtool.estimators.shaft.disturbances import Disturbances, waves_of
 from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.estimators.shaft.model import Problem, Run, fastest, largest_torque, positions, sizes_of, whitener
 from pmsmtool.machine.parameters import Estimate
@@ -214,17 +215,57 @@ def test_more_noise_is_what_the_residual_of_each_push_and_of_all_coasting_asks_f
     runs = [_run(np.zeros(n + 1), np.full(n, 0.5), coasting=kind, noise=noise)
             for n, kind, noise in ((9, False, 0.01), (19, True, 0.0), (9, False, 0.02), (29, True, 2e-4))]  # fmt: skip
     parts = [np.full(10, 1.5), np.full(20, 1.0), np.full(10, 4.0), np.full(30, 2.0)]
-    found = mechanics._noisier(runs, np.concatenate([*parts, np.full(7, 99.0)]), 0.5)
+    found = model.noisier(runs, np.concatenate([*parts, np.full(7, 99.0)]))
     coasting = math.sqrt((20.0 * 1.0 + 30.0 * 4.0) / 50.0)
-    floor = mechanics.COASTING_FLOOR * 0.5
-    expected = [1.5 * 0.01, coasting * floor, mechanics.GROWTH_MOST * 0.02, coasting * 2e-4]
+    floor = model.COASTING_FLOOR * 0.5
+    expected = [1.5 * 0.01, coasting * floor, model.GROWTH_MOST * 0.02, coasting * 2e-4]
     assert [run.torque_std for run in found] == pytest.approx(expected, rel=EXACT)
     quiet = np.concatenate([np.full(10, 1.1), np.full(20, 1.1), np.full(10, 1.1), np.full(30, 1.1)])
-    assert mechanics._noisier(runs, quiet, 0.5) is runs
-    assert mechanics._noisier(runs, np.tile([0.5, 1.5], 35), 0.5) is runs  # 1.25 each
-    assert mechanics._noise(runs) == pytest.approx({False: 0.04, True: 4e-4})
+    assert model.noisier(runs, quiet) is runs
+    assert model.noisier(runs, np.tile([0.5, 1.5], 35)) is runs  # 1.25 each
+    assert model.torque_noise(runs) == pytest.approx({False: 0.04, True: 4e-4})
     assert mechanics._unexplained(runs, [replace(runs[0], torque_std=0.081)])
     assert not mechanics._unexplained(runs, [replace(runs[0], torque_std=0.04), replace(runs[1], torque_std=3.9e-4)])
+
+
+def test_slow_modes_ask_for_noise_that_the_mean_of_all_hides() -> None:
+    """One mode of 250 is 0.2 of the noise of all, and 3 or 4 times that of the slow ones."""
+    for square, push in ((30.0, 1.0), (40.0, 2.0)):
+        for mode, coasting in ((9, math.sqrt(square / 10.0)), (32, 1.0)):
+            modes = np.zeros(250)
+            modes[mode] = math.sqrt(square)
+            part = np.asarray(idct(modes, norm="ortho"))
+            runs = [_run(np.zeros(250), np.full(249, 0.5), coasting=k > 0, noise=0.01) for k in range(3)]
+            found = model.noisier(runs, np.tile(part, 3), slow=True)
+            factors = (min(push, coasting), coasting, coasting)
+            assert [run.torque_std / 0.01 for run in found] == pytest.approx(factors, rel=EXACT)
+            assert model.noisier(runs, np.tile(part, 3)) is runs
+
+
+def test_orders_of_a_cogging_stand_out_of_a_residual_beside_what_its_fit_takes() -> None:
+    J, t = 1e-3, np.linspace(0.0, 0.5, 121)
+    runs = [
+        _run(sign * (6.0 * t - 5.0 * t * t), np.zeros(120), 0.5 / 120, coasting=True, noise=1e-3) for sign in (1, -1)
+    ]
+
+    def fitted(sizes: dict[int, float], taken: int = 0) -> Fit:
+        def columns(order: int) -> Array:
+            return np.concatenate(
+                [whitener(run, J) @ model._ways(run, J) @ waves_of(run.theta, [order]) for run in runs]
+            )
+
+        residual = np.append(sum((size * columns(order)[:, 1] for order, size in sizes.items()), np.zeros(242)), 0.0)
+        jacobian = np.append(columns(taken), [[0.0, 0.0]], axis=0) if taken else np.eye(243, 1)
+        return Fit(np.array([math.log(J)]), residual, jacobian, True, 1)
+
+    assert model.cogging_orders(runs, fitted({15: 0.01, 31: 0.004})) == [15, 31]
+    assert (
+        model.cogging_orders(runs, fitted({15: 0.01, 31: 1e-5})) == [15]
+        and model.cogging_orders(runs, fitted({})) == []
+    )
+    assert model.cogging_orders(runs, fitted({15: 0.01}, taken=15)) == []
+    steep = [_run(np.array([0.0, 0.6, 1.1]), np.zeros(2), coasting=True, noise=1e-3)]
+    assert model.cogging_orders(steep, fitted({})) == [], "no order above the encoder's in blocks of 0.6 rad"
 
 
 def test_friction_that_may_be_all_of_the_torque_is_useless() -> None:

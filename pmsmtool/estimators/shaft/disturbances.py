@@ -69,13 +69,15 @@ class Extent:
     """Sizes of a run: fastest speed (rad/s), largest torque (N m) and the pushes' doubt in proportion to the speed.
 
     ``tilt_std`` is the standard deviation of a push's torque at the fastest speed, of the largest; ``encoder`` what
-    the positions are without of the encoder's error (rad), and how well that is known.
+    the positions are without of the encoder's error (rad), and how well that is known; ``orders`` per turn are those of
+    the cogging that a fit without it left (``cogging_orders``).
     """
 
     speed_rad_s: float
     torque_nm: float
     tilt_std: float
     encoder: Sequence[Harmonic] = UNKNOWN
+    orders: Sequence[int] = ()
 
 
 def encoder_prior(turned: Sequence[Harmonic], pole_pairs: int) -> Sequence[Harmonic]:
@@ -86,6 +88,17 @@ def encoder_prior(turned: Sequence[Harmonic], pole_pairs: int) -> Sequence[Harmo
         share = ENCODER_STD_RAD**2 / (ENCODER_STD_RAD**2 + std**2)
         prior.append(Harmonic(h.order, share * h.cosine, share * h.sine, ENCODER_STD_RAD * math.sqrt(1.0 - share)))
     return prior or UNKNOWN
+
+
+def _mean(wave: Callable[[Array], Array], order: int, theta: Array) -> Array:
+    """Mean of a wave of the angle between positions, over intervals of nearly constant speed."""
+    way = np.diff(theta)
+    return np.asarray(wave(order * (theta[:-1] + 0.5 * way)) * np.sinc(order * way / (2.0 * np.pi)))
+
+
+def waves_of(theta: Array, orders: Sequence[int]) -> Array:
+    """Return the means of cosine and sine of every order between positions, shape (n, 2 k), theta of shape (n + 1,)."""
+    return np.stack([_mean(wave, order, theta) for order in orders for wave in WAVES], axis=1)
 
 
 def disturbances(theta: Array, torque: Array, T: float, extent: Extent, pole_pairs: int) -> Disturbances:
@@ -108,12 +121,10 @@ def disturbances(theta: Array, torque: Array, T: float, extent: Extent, pole_pai
     rows = (len(theta) - 1) // blocks
     sign = np.sign(np.diff(theta))
     t = np.linspace(-1.0, 1.0, len(theta))
-    theta = np.asarray(legendre.legval(t, legendre.legfit(t, theta, SMOOTH_DEGREE)), dtype=np.float64)
-    way = np.diff(theta)
-    middle = theta[:-1] + 0.5 * way
+    shown, theta = theta, np.asarray(legendre.legval(t, legendre.legfit(t, theta, SMOOTH_DEGREE)), dtype=np.float64)
 
     def means(wave: Callable[[Array], Array], order: int) -> Array:
-        return wave(order * middle) * np.sinc(order * way / (2.0 * np.pi))  # over an interval of nearly constant speed
+        return _mean(wave, order, theta)
 
     def blocked(torque_share: Array) -> Array:
         return np.asarray(extent.torque_nm * torque_share.reshape(blocks, rows).mean(axis=1))
@@ -130,6 +141,7 @@ def disturbances(theta: Array, torque: Array, T: float, extent: Extent, pole_pai
     for order, driven in ((pole_pairs, torque != 0.0), (2 * pole_pairs, np.sign(torque))):
         if order not in ENCODER_ORDERS:
             torques += [ELECTRICAL_STD * blocked(means(wave, order)) * driven for wave in WAVES]
+    torques += [ANGLE_STD * blocked(_mean(wave, order, shown)) for order in extent.orders for wave in WAVES]
     return Disturbances(
         np.column_stack([*torques, np.zeros((blocks, len(positions)))]),
         np.column_stack([np.zeros((blocks + 1, len(torques))), *positions]),

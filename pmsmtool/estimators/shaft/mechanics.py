@@ -25,7 +25,6 @@ from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.angle_harmonics import LEAST_SPEED, AngleHarmonics, Harmonic, angle_harmonics
 from pmsmtool.estimators.estimate import (
-    CHI2_WARN,
     COVERAGE_FACTOR,
     SensorTolerance,
     chi2_gate,
@@ -36,7 +35,19 @@ from pmsmtool.estimators.estimate import (
 )
 from pmsmtool.estimators.least_squares import RELATIVE_STEP, Fit, levenberg_marquardt, linear_solve
 from pmsmtool.estimators.shaft.disturbances import NONE, TILT_FLOOR, Extent, disturbances, encoder_prior
-from pmsmtool.estimators.shaft.model import SHAFT, Problem, Run, fastest, largest_torque, sizes_of, whitener
+from pmsmtool.estimators.shaft.model import (
+    COASTING_FLOOR,
+    SHAFT,
+    Problem,
+    Run,
+    cogging_orders,
+    fastest,
+    largest_torque,
+    noisier,
+    sizes_of,
+    torque_noise,
+    whitener,
+)
 from pmsmtool.estimators.shaft.position import encoder_step, position_noise, position_std
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.refusals import refuse
@@ -66,9 +77,6 @@ PATIENT_FITS = 2
 """Fits after which the noise grows before a minimum, too: a shaft that the model is far from has none."""
 TORQUE_FLOOR = 1e-3
 """Deviation of a block's torque beyond the noise of the currents, of the push's: ripple that samples do not show."""
-COASTING_FLOOR = 1e-4  # the same of a coasting, from where it grows
-GROWTH_MOST = 2.5
-"""Largest growth of the torque's noise from one fit to the next: a fit that has not arrived asks for too much."""
 SEPARABLE = 0.5e7
 """Largest condition number: a covariance is good to 1e7; below, a friction that is known badly leaves J as it is."""
 RIPPLE_MOST = 0.15
@@ -195,11 +203,11 @@ def estimate_mechanics(
     known = replace(harmonics, encoder_rad=tuple(prior))
 
     def fitted(runs: Sequence[Trace]) -> Fitted:
-        def blocks_of(J_kgm2: float) -> list[Run]:
+        def blocks_of(J_kgm2: float, orders: Sequence[int] = ()) -> list[Run]:
             given = (torque, abs(torque_per_a) * sigma_a, direction, pole_pairs, step, known, J_kgm2)
             found = [_blocks(run, *given) for run in runs]
             sizes = fastest([run for _, run in found]), largest_torque([run for _, run in found])
-            extent = Extent(*sizes, tilt_std, prior)
+            extent = Extent(*sizes, tilt_std, prior, orders)
             return [
                 replace(run, disturbances=disturbances(theta, run.torque, run.T, extent, pole_pairs))
                 for theta, run in found
@@ -209,10 +217,15 @@ def estimate_mechanics(
         start = _start(blocks)
         if harmonics.acceleration_rad_s2:
             # the torque over the angle is known as an acceleration: it takes the inertia of a fit before
-            found = _fit(blocks_of(math.exp(start[0])), start, elastic)[0].x
-            start = np.delete(found, range(SHAFT, len(found) - 2 * len(runs)))
+            start = _without_shapes(_fit(blocks_of(math.exp(start[0])), start, elastic)[0], len(runs))
             blocks = blocks_of(math.exp(start[0]))
-        return blocks, *_fit(blocks, start, elastic)
+        found, chi2, noisy = _fit(blocks, start, elastic)
+        if _unexplained(blocks, noisy) and (orders := cogging_orders(noisy, found)):
+            blocks = blocks_of(math.exp(found.x[0]), orders)
+            found, chi2, noisy = _fit(blocks, _without_shapes(found, len(runs)), elastic)
+        if (slower := noisier(noisy, found.residual, slow=True)) is not noisy:
+            found, noisy = _minimum(slower, found.x, sizes_of(slower, drag=True)), slower
+        return blocks, found, chi2, noisy
 
     blocks, with_drag, chi2, noisy = _explained(fitted, runs)
     # where the other parameters would lead without the drag: left as they are, they may be too far off for a fit
@@ -250,7 +263,7 @@ def estimate_mechanics(
                  method=METHOD, fallback="" if value else f"held at zero: the fit alone has {alone:.2g} {unit}")
         for value, std, unit, alone in zip((J, B, tau_c), stds, MEANS.values(), without.x, strict=False)
     )  # fmt: skip
-    ripple, unexplained = max(_noise(noisy).values()), _unexplained(blocks, noisy)
+    ripple, unexplained = max(torque_noise(noisy).values()), _unexplained(blocks, noisy)
     return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, unexplained, harmonics, drag)
 
 
@@ -327,12 +340,12 @@ def _explained(fitted: Callable[[Sequence[Trace]], Fitted], runs: Sequence[Trace
         fast = fitted([_fast(run) for run in runs])
     except IdentificationError:
         return whole
-    return fast if max(_noise(fast[3]).values()) < max(_noise(whole[3]).values()) else whole
+    return fast if max(torque_noise(fast[3]).values()) < max(torque_noise(whole[3]).values()) else whole
 
 
 def _unexplained(blocks: Sequence[Run], noisy: Sequence[Run]) -> bool:
     """Whether the torque's noise grew so much in a fit that the intervals are notably wider."""
-    before, noise = _noise(blocks), _noise(noisy)
+    before, noise = torque_noise(blocks), torque_noise(noisy)
     return any(noise[kind] > UNEXPLAINED * max(before[kind], COASTING_FLOOR) for kind in noise)
 
 
@@ -449,30 +462,25 @@ def _fit(runs: Sequence[Run], start: Array, elastic: bool) -> tuple[Fit, float, 
         fit = _minimum(runs, x, scale)
         x = fit.x
         chi2 = fit.cost / fit.dof
-        noise = _noise(runs)
-        ripple = max(noise.values())
-        noisier = _noisier(runs, fit.residual, largest)
+        ripple = max(torque_noise(runs).values())
+        more = noisier(runs, fit.residual)
         if ripple > RIPPLE_MOST and not elastic:
             what = (f"torque off by {100.0 * ripple:.2g} % of that of the pulses, and more, from one "
                     f"{1e3 * runs[0].T:.2g} ms to the next, limit {100.0 * RIPPLE_MOST:g} %")  # fmt: skip
             hint = "`identify R L psi encoder poles inverter frf` finds the resonance of an elastic shaft, and J"
             raise refuse("E_MODEL_MISMATCH", what, stage=STAGE, likely=NOISY_TORQUE, hint=hint)
         if fit.converged or count >= PATIENT_FITS:
-            if fit.converged and count and noisier is runs:
+            if fit.converged and count and more is runs:
                 break
-            runs = noisier  # before a minimum the residual says little of the noise
+            runs = more  # before a minimum the residual says little of the noise
     if not fit.converged:
         raise refuse("E_NOT_CONVERGED", f"{fit.iterations} steps without a minimum", stage=STAGE)
     return fit, chi2, runs
 
 
-def _noise(runs: Sequence[Run]) -> dict[bool, float]:
-    """Deviation of a block's torque in pushes (False) and coasting (True), of the push's torque."""
-    largest = largest_torque(runs)
-    return {
-        kind: max((run.torque_std for run in runs if run.coasting is kind), default=0.0) / largest
-        for kind in (False, True)
-    }
+def _without_shapes(fit: Fit, traces: int) -> Array:
+    """Return the parameters of a fit without those of the drag and the disturbances."""
+    return np.delete(fit.x, range(SHAFT, len(fit.x) - 2 * traces))
 
 
 def _minimum(runs: Sequence[Run], x: Array, scale: Array) -> Fit:
@@ -480,24 +488,3 @@ def _minimum(runs: Sequence[Run], x: Array, scale: Array) -> Fit:
     sizes = runs[0].disturbances.torque.shape[1]
     problem = Problem(runs, factors, RELATIVE_STEP * scale, drag=len(x) == SHAFT + 1 + sizes + 2 * len(runs))
     return levenberg_marquardt(problem.residual, x, scale, cost_tolerance=1e-4, derivative=problem.jacobian)
-
-
-def _noisier(runs: Sequence[Run], residual: Array, largest: float) -> Sequence[Run]:
-    """Return the runs with as much more noise of the torque as the residual asks for; the same where it agrees.
-
-    Every push by itself, one through standstill asks for more than one from rest; coasting together.
-    """
-    ends = np.cumsum([len(run.theta) for run in runs])
-    parts = np.split(residual[: ends[-1]], ends[:-1])
-    coasting = np.concatenate([part for part, run in zip(parts, runs, strict=True) if run.coasting])
-    own = [coasting if run.coasting else part for part, run in zip(parts, runs, strict=True)]
-    more = [
-        min(math.sqrt(chi2), GROWTH_MOST) if (chi2 := float(part @ part) / len(part)) > CHI2_WARN else 1.0
-        for part in own
-    ]
-    if max(more) == 1.0:
-        return runs
-    return [
-        run if factor == 1.0 else replace(run, torque_std=factor * max(run.torque_std, COASTING_FLOOR * largest))
-        for run, factor in zip(runs, more, strict=True)
-    ]

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from pmsmtool.arrays import Array
-from pmsmtool.estimators.shaft.disturbances import NONE, Disturbances
+from pmsmtool.estimators.angle_harmonics import ENCODER_ORDERS, HIGHEST_ORDER, ORDERS_MOST, SURE
+from pmsmtool.estimators.estimate import CHI2_WARN
+from pmsmtool.estimators.least_squares import Fit
+from pmsmtool.estimators.shaft.disturbances import NONE, Disturbances, waves_of
 
 SHAFT = 3
 """Parameters of the shaft without drag: ln J, B, tau_c."""
@@ -25,6 +28,20 @@ DECAY_MOST = 50.0
 """Largest B T/J that is summed up at once."""
 SMALLEST_DECAY = 1e-9
 """B T/J below which an interval is a parabola."""
+
+
+COASTING_FLOOR = 1e-4
+"""Deviation of a block's torque in a coasting, of the push's, from where it grows."""
+GROWTH_MOST = 2.5
+"""Largest growth of the torque's noise from one fit to the next: a fit that has not arrived asks for too much."""
+SLOW_LEAST = 6
+"""Least slow modes of a trace's residual that are looked at; its first position and speed take two of them."""
+SLOW_PART = 8
+"""Modes of a residual for each slow one: friction and inertia move the first 10 of 250, a swing more of them."""
+SLOW_SURE = 5.0
+"""Standard deviations of a mean square from which on slow modes hold more than noise."""
+STEEPEST = 1.5
+"""Largest angle of an order over a block (rad): a cogging that is finer goes through half a period within one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,13 +152,102 @@ def whitener(run: Run, J: float) -> Array:
     """Return the inverse of the Cholesky factor of the position residual's covariance."""
     from scipy.linalg.lapack import dtrtri  # a third of the time of numpy's inverse
 
-    n = len(run.theta)
     if run.torque_std == 0.0:
         return np.diag(1.0 / run.theta_std)
-    lag = np.arange(n)[:, None] - np.arange(n - 1)[None, :] - 0.5
-    G = np.maximum(lag, 0.0) * run.T**2 / J
+    G = _ways(run, J)
     covariance = np.diag(run.theta_std**2) + run.torque_std**2 * (G @ G.T)
     return np.asarray(dtrtri(np.linalg.cholesky(covariance), lower=1)[0])
+
+
+def _ways(run: Run, J: float) -> Array:
+    """Return the ways that a torque in each interval has made at each position (rad/(N m)), without friction."""
+    n = len(run.theta)
+    lag = np.arange(n)[:, None] - np.arange(n - 1)[None, :] - 0.5
+    return np.asarray(np.maximum(lag, 0.0) * run.T**2 / J)
+
+
+def torque_noise(runs: Sequence[Run]) -> dict[bool, float]:
+    """Deviation of a block's torque in pushes (False) and coasting (True), of the push's torque."""
+    largest = largest_torque(runs)
+    return {
+        kind: max((run.torque_std for run in runs if run.coasting is kind), default=0.0) / largest
+        for kind in (False, True)
+    }
+
+
+def noisier(runs: Sequence[Run], residual: Array, *, slow: bool = False) -> Sequence[Run]:
+    """Return the runs with as much more noise of the torque as the residual asks for; the same where it agrees.
+
+    Every push by itself, one through standstill asks for more than one from rest; coasting together. ``slow``: as much
+    as its slow modes ask for, of a fit whose noise agrees as a whole.
+    """
+    ends = np.cumsum([len(run.theta) for run in runs])
+    parts = np.split(residual[: ends[-1]], ends[:-1])
+    coasting = [part for part, run in zip(parts, runs, strict=True) if run.coasting]
+    own = [coasting if run.coasting else [part] for part, run in zip(parts, runs, strict=True)]
+    more = [math.sqrt(_slow_excess(part)) if slow else min(math.sqrt(_excess(part)), GROWTH_MOST) for part in own]
+    if max(more) == 1.0:
+        return runs
+    floor = COASTING_FLOOR * largest_torque(runs)
+    return [
+        run if factor == 1.0 else replace(run, torque_std=factor * max(run.torque_std, floor))
+        for run, factor in zip(runs, more, strict=True)
+    ]
+
+
+def _excess(parts: Sequence[Array]) -> float:
+    """Return the mean square of whitened residuals; 1 where it is no more than noise."""
+    whole = float(np.mean(np.concatenate(parts) ** 2))
+    return whole if whole > CHI2_WARN else 1.0
+
+
+def _slow_excess(parts: Sequence[Array]) -> float:
+    """Return the mean square of their slow modes; 1 where it is no more than noise.
+
+    What is slow moves friction and inertia, and hides in the mean of all: over the cogging of a light shaft that was
+    1.2, of 12 modes 10, and B was 5 times too large at +-199 %.
+    """
+    from scipy.fft import dct
+
+    count = min(map(len, parts)) // SLOW_PART
+    power = np.mean([np.asarray(dct(part, norm="ortho"))[:count] ** 2 for part in parts], axis=0)
+    modes = np.arange(SLOW_LEAST, count + 1)
+    means = np.cumsum(power)[SLOW_LEAST - 1 :] / modes
+    return float(max([1.0, *means[means > 1.0 + SLOW_SURE * np.sqrt(2.0 / (len(parts) * modes))]]))
+
+
+def cogging_orders(runs: Sequence[Run], fit: Fit) -> list[int]:
+    """Return orders per turn of a torque over the angle that stand out of a fit's residual, the largest first.
+
+    Beside what the fit's own parameters take, one order after the other (as ``estimators/angle_harmonics``, which
+    needs a turn of coasting and sees no push); linear about the fit.
+
+    Parameters
+    ----------
+    runs : sequence of Run
+        With the torque's noise of the fit.
+    fit : Fit
+        Of a :class:`Problem` of them.
+    """
+    steepest = max(float(np.max(np.abs(np.diff(run.theta)))) for run in runs)
+    orders = np.arange(max(ENCODER_ORDERS) + 1, min(HIGHEST_ORDER, int(STEEPEST / steepest)) + 1)
+    if not len(orders):
+        return []
+    J = math.exp(float(fit.x[0]))
+    shown = [whitener(run, J) @ np.dot(_ways(run, J), waves_of(run.theta, orders.tolist())) for run in runs]
+    columns = np.concatenate([*shown, np.zeros((len(fit.residual) - sum(map(len, shown)), 2 * len(orders)))])
+    taken, rest, chosen = np.linalg.qr(fit.jacobian)[0], fit.residual, list[int]()
+    while len(chosen) < min(ORDERS_MOST, len(orders)):
+        columns, rest = columns - taken @ (taken.T @ columns), rest - taken @ (taken.T @ rest)
+        pairs = columns.reshape(len(rest), -1, 2)
+        power = [float(np.sum((np.linalg.qr(pairs[:, k])[0].T @ rest) ** 2)) for k in range(len(orders))]
+        best = int(np.argmax(power))
+        if not power[best] > SURE**2:
+            break
+        chosen.append(int(orders[best]))
+        taken = np.linalg.qr(pairs[:, best])[0]
+        orders, columns = np.delete(orders, best), np.delete(columns, (2 * best, 2 * best + 1), axis=1)
+    return chosen
 
 
 def positions(torque: Array, T: float, x: Array) -> Array:
