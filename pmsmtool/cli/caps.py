@@ -48,6 +48,8 @@ def caps_command(bus: BusOptions, out: Output, machine: Path | None, map_file: P
     from pmsmtool.flash.map_gate import other_drive, unknown_firmware
     from pmsmtool.machine.machine_file import load_machine_file
     from pmsmtool.measurement.capabilities import examine
+    from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, named_addresses
+    from pmsmtool.measurement.learn_position_gain import POSITION
     from pmsmtool.params.catalogue import BY_NAME
     from pmsmtool.sim.foreign.drive import assumptions_of
 
@@ -59,9 +61,13 @@ def caps_command(bus: BusOptions, out: Output, machine: Path | None, map_file: P
         assumed = assumptions_of(eds, None if machine is None else load_machine_file(machine))
     with open_node(bus, within_s=LOOKING_S) as node:
         found = as_in_file(examine(node, given, may_try=eds is not None), eds)
+        held = ((name, named_addresses(found.drive_map, name)) for name in (GAIN, INTEGRAL, POSITION))
+        learned = [name for name, addresses in held if any(node.has(*address) for address in addresses)]
     refused = refused_of_design(machine, found, out)
-    facts = {**_facts(found), **({"refused": refused} if machine is not None else {})}
+    facts = {**_facts(found), "learned": learned, **({"refused": refused} if machine is not None else {})}
     out.result("caps", facts, lambda: _lines(found, out.verbosity > 0, asked=eds is None))
+    if learned:
+        out.note(f"`pmsmtool map learn` measures on the free shaft what one count is worth of: {', '.join(learned)}")
     for name, why in found.drive_map.not_written(BY_NAME).items():
         if name not in found.drive_map.left_out:
             out.detail(f"not written: {name}: {why}")
@@ -163,12 +169,9 @@ def _unwritten(found: Capabilities) -> dict[str, str]:
 
 def _parameter_lines(found: Capabilities, sources: bool) -> list[str]:
     """Say value by value what `flash-params` writes; what the map does not even name is a number (-v: by name)."""
-    from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, named_addresses
-    from pmsmtool.measurement.learn_position_gain import POSITION
     from pmsmtool.params.catalogue import BY_NAME
 
     drive_map = found.drive_map
-    learned = ", ".join(name for name in (GAIN, INTEGRAL, POSITION) if named_addresses(drive_map, name))
     others = len(drive_map.not_written(BY_NAME).keys() - drive_map.left_out.keys())
     reasons = ((drive_map.row_text(n) if sources else n, why) for n, why in _unwritten(found).items())
     written = {name: drive_map.cells[name] for name in _written(found)}
@@ -184,7 +187,6 @@ def _parameter_lines(found: Capabilities, sources: bool) -> list[str]:
         *(f"not written: {line}" for line in by_reason(reasons)),
         *(f"not written: {name}: {why}" for name, why in drive_map.left_out.items() if name in BY_NAME),
         *([f"not written: {others} other parameters, which the map has no row for"] if others else []),
-        *([f"`pmsmtool map learn` measures on the free shaft what a count is worth of: {learned}"] if learned else []),
     ]
 
 

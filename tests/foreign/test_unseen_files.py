@@ -466,6 +466,16 @@ def test_the_file_of_a_known_family_needs_no_map_and_that_of_an_unknown_one_is_t
     assert code == 0 and "no map names this drive (epos2, epos4: of other products of its maker)" in said
 
 
+def test_caps_names_the_gains_whose_unit_the_drive_itself_shows(tool: Tool) -> None:
+    """That `map learn` measures them stood in one page of docs/ alone."""
+    gains: list[Row] = [(0x60F9, 1, "I16", "rw", "500"), (0x60F9, 2, "I16", "rw", "80")]
+    for more, learned in (([], []), (gains, ["speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"])):
+        write_eds(Path("x.eds"), [*copley(), *more])
+        code, out, said = tool("caps", "--eds", "x.eds", "--json")
+        assert code == 0 and json.loads(out)["learned"] == learned
+        assert ("`pmsmtool map learn` measures" in said) == bool(learned)
+
+
 @pytest.mark.parametrize(("word", "code"), [("0x0240", 0), ("0x0237", 8)])
 def test_a_further_axis_that_stays_on_is_no_confirmed_stop(tool: Tool, word: str, code: int) -> None:
     """ "stopped", exit code 0, was said of a device whose second axis was in operation enabled."""
