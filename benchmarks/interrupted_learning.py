@@ -41,7 +41,7 @@ import can
 
 from benchmarks.commissioning import commanded, powered, prepared
 from benchmarks.interrupted_commands import KILLED, MEMORY_WAIT_S, OWN_STOP_S, TO_DO, Watch
-from benchmarks.learned_gains import FAMILIES, SPEED_SHARE, machine_at, stated
+from benchmarks.learned_gains import FAMILIES, machine_at, stated
 from benchmarks.random_drives import draw_drive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.flash.gain_journal import any_left
@@ -53,13 +53,15 @@ from pmsmtool.measurement.learn_current_gains import CURRENT_GAIN
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.sim.foreign.drawn_gains import ACCELERATION_OBJECT
 from pmsmtool.sim.simulated_machine import settings_of
-from pmsmtool.units import rad_s_from_rpm
+from pmsmtool.units import rad_s_from_rpm, rpm_from_rad_s
 
 LEARN_WAYS = ("kill", "adapter", "freeze", "ctrl-c", "error", "power")
 SHORT = {
     (learn_gains, "LEAST_S"): 0.6, (learn_position_gain, "WAY_RAD"): 9.0, (learn_current_gains, "RECORDS"): 1,
 }  # fmt: skip
 """What makes a run shorter."""
+LIMIT_SHARE = 0.4
+"""Speed limit, of the machine's largest speed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +139,7 @@ def learning(table: str, seed: int, due: Sequence[tuple[int, str]] = ()) -> tupl
         machine = draw_drive(3000 + seed)
         told_machine = stated(machine, seed)
         Path("told.toml").write_text(dump_machine_file(told_machine), encoding="utf-8")
-        limit = SPEED_SHARE * rad_s_from_rpm(told_machine.machine.top_rpm or 1000.0)
+        limit = LIMIT_SHARE * rad_s_from_rpm(told_machine.machine.top_rpm or 1000.0)
         J = settings_of(machine).number("J_kgm2")
 
         def truth(*arguments: Any, **options: Any) -> SpeedLoop:
@@ -175,7 +177,8 @@ def learning(table: str, seed: int, due: Sequence[tuple[int, str]] = ()) -> tupl
         if face.gains.current is not None:
             names.append(CURRENT_GAIN)
         with watch.on():
-            code, told = commanded("map", "learn", *names, "--machine", "told.toml", *on)
+            limited = ("--speed-max", f"{rpm_from_rad_s(limit):.6g}rpm")
+            code, told = commanded("map", "learn", *names, "--machine", "told.toml", *limited, *on)
             watch.over, how = True, watch.how
             alive = how in ("ctrl-c", "error") or (how == "freeze" and not watch.enabled)
             if how == "kill" and watch.happened:

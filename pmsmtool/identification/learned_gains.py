@@ -15,8 +15,10 @@ from pmsmtool.identification.asked_current import AskedLoop
 from pmsmtool.identification.speed_loop_response import SpeedLoop
 
 NORMAL_95 = 1.96
-WIDEST = 0.12
-"""Half width (95 %, relative) of a scale beyond which it stays unknown: 12 % of a gain is 1 dB."""
+WIDEST, WIDEST_STATED = 0.12, 0.25
+"""Half widths (95 %, relative) of a scale beyond which it stays unknown: 12 % of a gain is 1 dB. The larger one counts
+with what the scale rests on. A design rests on the same inertia, so that its error is in both, and the loop has none of
+it; a data sheet's 10 % of inertia alone take 11 of 12 %, and no gain was decided on catalogue motors."""
 MODEL_DOUBT = (0.02, 0.03)
 """What the loop's model leaves of K_p and of K_i (standard deviation, relative): unknown filters, dead time, friction.
 Measured on random drives whose EMF takes little: 0 to 3 % and 0 to 2 % (docs/learned-gains.md)."""
@@ -81,12 +83,20 @@ class Basis:
     std: float
     """SI value, and its standard deviation."""
     widest: float = WIDEST
-    """Half width (95 %) of a scale beyond which it stays unknown."""
+    """Half width (95 %) of what is measured of a scale, beyond which it stays unknown."""
     model: tuple[float, float] = MODEL_DOUBT
     change: tuple[float, float, float] = CHANGE_DOUBT
     """Standard deviations of K_p and K_i, and of a ratio of two K_p, K_i or K_i / K_p."""
     units: Mapping[str, str] = field(default_factory=lambda: UNITS)
     """Of one count, by form; ``gain`` is K_p."""
+
+    def half_width(self, std: float) -> float:
+        """Return the 95 % half width of a scale that is measured with a standard deviation (relative)."""
+        return NORMAL_95 * math.hypot(std, self.std)
+
+    def too_wide(self, std: float) -> bool:
+        """Whether such a scale stays unknown: what a design makes of the same inertia does not count in full."""
+        return NORMAL_95 * std > self.widest or self.half_width(std) > WIDEST_STATED
 
 
 def current_basis(L_h: float, L_std: float) -> Basis:
@@ -262,9 +272,9 @@ def gain_scale(base: Sequence[Observation], gain_changed: Observation | None, ba
         return Learned(name, None, math.inf, None, "", why)
     logs = [_log(o, K_P) - math.log(o.gain) for o in (base[0], gain_changed, base[1])]
     mean, std = _of_all(logs[:-1], logs[-1])
-    std = math.hypot(std, basis.model[0], base[0].std, base[0].model_std[K_P], basis.std)
-    scale, half, unit = basis.value * math.exp(mean), NORMAL_95 * std, basis.units["gain"]
-    if half > basis.widest:
+    std = math.hypot(std, basis.model[0], base[0].std, base[0].model_std[K_P])
+    scale, half, unit = basis.value * math.exp(mean), basis.half_width(std), basis.units["gain"]
+    if basis.too_wide(std):
         return Learned(name, None, half, "value", unit, f"its interval of {100 * half:.2g} % is too wide")
     return Learned(name, scale, half, "value", unit)
 
@@ -312,8 +322,9 @@ def integral_scale(
         logs.append((-kept if best == "time" else kept) - math.log(o.integral))
     mean, std = _of_all(logs[:-1], logs[-1])
     model_std = base[0].model_std[RATE if relative else K_I]
-    half = NORMAL_95 * math.hypot(std, basis.model[1], base[0].std, model_std, 0.0 if relative else basis.std)
-    if half > basis.widest:
+    std, rests = math.hypot(std, basis.model[1], base[0].std, model_std), replace(basis, std=0.0) if relative else basis
+    half = rests.half_width(std)
+    if rests.too_wide(std):
         return unknown(f"its interval of {100 * half:.2g} % is too wide", best, half)
     scale = math.exp(mean) if relative else basis.value * math.exp(mean)
     return Learned(name, scale, half, best, basis.units[best], "", chi_squares)

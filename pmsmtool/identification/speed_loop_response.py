@@ -321,10 +321,15 @@ def fit_speed_loop(
     return SpeedLoop(K_p, K_i, lag, times["late"], amps, math.sqrt(float(np.mean(left**2))), next(ends, ""))
 
 
+MOST_LEFT = 1e9
+"""Largest residual, in standard deviations of the noise: squares of all samples stay finite."""
+
+
 def _weighted(model: _Model, p: Array, weights: Sequence[float]) -> Array:
-    position, current, _, _ = model.fitted(p)
-    found = [position / weights[0], current / weights[1]]
-    return np.concatenate(found)
+    with np.errstate(over="ignore", invalid="ignore"):  # a loop that is not stable leaves everything
+        position, current, _, _ = model.fitted(p)
+        found = np.concatenate([position / weights[0], current / weights[1]])
+    return np.clip(np.nan_to_num(found, nan=MOST_LEFT), -MOST_LEFT, MOST_LEFT)
 
 
 def _solve(model: _Model, first: Array, weights: Sequence[float]) -> Array:

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 
 from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
-from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive
-from pmsmtool.drive.motion_objects import limits_speed
+from pmsmtool.drive.guard import GuardedDrive
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.recorders.choice import recorder_of
 from pmsmtool.drive.recorders.commanded import CommandedRecorder
@@ -44,12 +43,13 @@ from pmsmtool.measurement.changed_gains import (
     while_changed,
 )
 from pmsmtool.measurement.learn_gains import (
-    HIGH_SHARE,
     INTEGRAL_DOWN,
     LEAST_MARGIN_DOWN_RAD,
     LEAST_MARGIN_RAD,
     SETTLE_S,
     TRIP,
+    high_share,
+    trip_share,
 )
 
 CURRENT_GAIN, CURRENT_INTEGRAL = "current.K_p_q_v_per_a", "current.K_i_q_v_per_as"
@@ -185,7 +185,7 @@ def learn_current_loop(
         drive.send_samples()
         with contextlib.ExitStack() as last:
             last.callback(drive.end_samples)
-            drive.fastest_rad_s = envelope.speed_max_rad_s * (OVERSHOOT if limits_speed(drive.node) else 1.0)
+            drive.fastest_rad_s = envelope.speed_max_rad_s * trip_share(drive.node)
             last.callback(_halt, recorder)
             last.callback(guard.quick_stop)
             guard.enable()
@@ -240,7 +240,7 @@ class _CurrentLearner:
     def _within_voltage(self, loop: CurrentLoop) -> float:
         """Return the size of the steps at which the loop does not reach its voltage limit."""
         winding, largest = self.winding, self._largest_a()
-        emf = winding.emf_vs_per_rad * HIGH_SHARE * self.guard.envelope.speed_max_rad_s
+        emf = winding.emf_vs_per_rad * high_share(self.drive.node) * self.guard.envelope.speed_max_rad_s
         left = VOLTAGE_SHARE * (winding.U_max_v - emf - winding.R_ohm * max(LEVELS) * largest)
         return min(1.0, max(0.0, left) / (loop.K_p_per_L * winding.L_h * STEP * largest))
 
@@ -255,7 +255,7 @@ class _CurrentLearner:
             asked = per_ampere * LEVELS[(max(k, LEAD_TICKS) - LEAD_TICKS + 1) % len(LEVELS)]
             speeds.append(free + asked / loop.K_p_per_J)
             free += asked * TICK_S
-        share = min(1.0, 2.0 * HIGH_SHARE * limit / max(speeds))
+        share = min(1.0, 2.0 * high_share(drive.node) * limit / max(speeds))
         low = -0.5 * share * max(speeds)
         speeds = [low + share * speed for speed in speeds]
         guard.command_speed(low)

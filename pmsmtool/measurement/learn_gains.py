@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import OVERSHOOT, GuardedDrive
 from pmsmtool.drive.motion_objects import limits_speed
@@ -27,7 +28,7 @@ from pmsmtool.identification.speed_loop_response import (
     phase_margin_rad,
 )
 from pmsmtool.machine.machine_file import MachineFile
-from pmsmtool.machine.parameters import Brake, Load, MachineParameters, Shaft
+from pmsmtool.machine.parameters import LINEAR_UTILISATION, Brake, Load, Shaft
 from pmsmtool.measurement.changed_gains import (
     DOWN,
     GAIN,
@@ -56,6 +57,9 @@ TRIP = 3.0
 """Oscillation over the one with the drive's own gains, at which the voltage is removed."""
 LOW_SHARE, HIGH_SHARE = 0.15, 0.7
 """Speeds between which the reference climbs and falls, of the speed limit."""
+HIGH_UNLIMITED, TRIP_UNLIMITED, MOST = 0.45, 0.65, 1.3
+"""The higher one on a drive that has no speed limit of its own, the speed at which the samples end its steps, and the
+speed that a shaft may have when the voltage is off, of the limit: the steps' current is what leaves that between."""
 STEP_CURRENT = 0.5
 """Current of a step, of what drive and envelope allow: large against friction and the inverter's dead time."""
 FIRST_STEP = 0.02
@@ -86,8 +90,10 @@ PULSE_TIMES, PULSE_SHOWN_S = 3.0, 0.02
 TIMES = {"lag": "the loop's lag", "late": "the delay of a reference", "age": "the age of the current"}
 LEAST_AT_REST = 40
 """Samples before the first step that the noise is read from."""
-SPEED_SHARE = 0.4
-"""Speed limit where none is asked for, of the largest speed of the machine: no field weakening."""
+SPEED_SHARE, UNLIMITED_SHARE = 0.4, 0.8
+"""Speed limit where none is asked for, of the machine's largest speed; where the drive has none of its own, of that and
+of the speed at which the EMF takes the whole voltage. With 0.4 the free shafts of three catalogue motors, which the
+rated torque accelerates by 20 000 to 50 000 rad/s2, had 3 to 11 % of their current, and friction took most of that."""
 DURATION_S = 180.0
 SEEN_S = 0.03
 """A speed beyond its limit is seen in the samples, and the voltage off, within this time."""
@@ -108,17 +114,34 @@ class LearnedLoop:
     """Whether everything rests on the current that the loop asks for; else on the one that flows."""
 
 
-def within_budget(drive: SpeedLoopDrive, machine: MachineParameters, i_max_apk: float, speed_max_rad_s: float) -> float:
-    """Return the largest current that needs :data:`SEEN_S` from the largest speed of the steps to the limit.
+def high_share(node: DriveNode) -> float:
+    """Return the largest speed of the steps, of the speed limit."""
+    return HIGH_SHARE if limits_speed(node) else HIGH_UNLIMITED
 
-    The drive's speed loop keeps the speed, also when the tool is dead; this is for a loop that runs away. A drive with
-    a speed limit of its own keeps it; of any other the current is cut.
+
+def trip_share(node: DriveNode) -> float:
+    """Return the speed at which the samples remove the voltage, of the speed limit."""
+    return OVERSHOOT if limits_speed(node) else TRIP_UNLIMITED
+
+
+def largest_speed(node: DriveNode, file: MachineFile) -> float:
+    """Return the speed limit where none is asked for (rad/s)."""
+    machine, top = file.machine, rad_s_from_rpm(file.machine.top_rpm or 0.0)
+    if limits_speed(node):
+        return SPEED_SHARE * top
+    flux = machine.pole_pairs * machine.psi_f_wb
+    return UNLIMITED_SHARE * (min(top, file.inverter.U_dc_v * LINEAR_UTILISATION / flux) if flux > 0.0 else top)
+
+
+def within_budget(node: DriveNode, acceleration: float | None, room_rad_s: float, seen_s: float) -> float:
+    """Return the share of a current, accelerating the shaft so (rad/s2), that needs a time for a rise of the speed.
+
+    The drive's own loop keeps the speed, also when the tool is dead; this is for a loop that runs away, until it is
+    seen and the voltage off. A drive with a speed limit of its own keeps it; of any other the current is cut.
     """
-    acceleration = largest_acceleration(machine, i_max_apk)
-    if limits_speed(drive.node) or acceleration is None:
-        return i_max_apk
-    room = (1.0 - HIGH_SHARE) * speed_max_rad_s
-    return i_max_apk * min(1.0, room / (acceleration * SEEN_S))
+    if limits_speed(node) or acceleration is None:
+        return 1.0
+    return min(1.0, room_rad_s / (acceleration * seen_s))
 
 
 def learning_envelope(
@@ -132,8 +155,10 @@ def learning_envelope(
 ) -> Envelope:
     """Return the limits within which gains are learned, from what was asked for."""
     machine = file.machine
-    speed_max = speed_max_rad_s or SPEED_SHARE * rad_s_from_rpm(machine.top_rpm or 0.0)
-    i_max = within_budget(drive, machine, i_max_apk or min(drive.rated_apk, drive.shows_apk), speed_max)
+    speed_max = speed_max_rad_s or largest_speed(drive.node, file)
+    i_max = i_max_apk or min(drive.rated_apk, drive.shows_apk)
+    room = (MOST - TRIP_UNLIMITED) * speed_max
+    i_max *= within_budget(drive.node, largest_acceleration(machine, i_max), room, SEEN_S)
     return Envelope(
         i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S, shaft=shaft or "free", load=load,
         brake=brake, acceleration_rad_s2=largest_acceleration(machine, i_max),
@@ -170,7 +195,7 @@ def learn_speed_loop(
         drive.send_samples()
         with contextlib.ExitStack() as last:
             last.callback(drive.end_samples)
-            drive.fastest_rad_s = envelope.speed_max_rad_s * (OVERSHOOT if limits_speed(drive.node) else 1.0)
+            drive.fastest_rad_s = envelope.speed_max_rad_s * trip_share(drive.node)
             last.callback(guard.quick_stop)
             return _Learner(guard, drive, put, emf, say).run(gain, integral)
 
@@ -246,7 +271,7 @@ class _Learner:
         self.guard, self.drive, self.put, self.emf, self.say = guard, drive, put, emf, say
         self.least_s = LEAST_S
         limit = guard.envelope.speed_max_rad_s
-        self.low, self.span = LOW_SHARE * limit, (HIGH_SHARE - LOW_SHARE) * limit
+        self.low, self.span = LOW_SHARE * limit, (high_share(drive.node) - LOW_SHARE) * limit
         self.bandwidth, self.hold_s, self.settle_s = FIRST_BANDWIDTH, HOLD_TIMES / FIRST_BANDWIDTH, SETTLE_S
         self.notes: list[str] = []
         self.shares: list[float] = []

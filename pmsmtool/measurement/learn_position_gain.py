@@ -41,7 +41,7 @@ from pmsmtool.measurement.changed_gains import (
     named_addresses,
     refuse_unsafe,
 )
-from pmsmtool.measurement.learn_gains import SEEN_S
+from pmsmtool.measurement.learn_gains import MOST, within_budget
 from pmsmtool.trace import Trace
 
 POSITION = "position.K_p_per_s"
@@ -54,9 +54,9 @@ SHORT_RAD = 0.5 * math.pi
 REST_S = 1.0
 TRAVEL = 1.3
 """Largest travel, of the way."""
-UNWATCHED_SHARE = SEEN_S / (2.0 * WATCH_S)
-"""Current of the moves of a drive without a speed limit, of that of the steps: their speed is watched by the guard's
-looks alone, and two of them take longer than the samples need."""
+FASTEST, UNWATCHED_S = 2.0, 2.0 * WATCH_S
+"""Speed that ends the moves of a drive without a speed limit, of the one asked for, and time until the voltage is off
+where only the guard's looks watch it. With 0.3 of the current of the steps friction ended those of light rotors."""
 BEHIND = 0.5
 """Largest lag of a shaft that does not follow, of the way."""
 SEEN, AIM, GROWTH, FORWARD_MOVES = 0.3, 0.8, 8.0, 10
@@ -132,7 +132,10 @@ def _moved(
     areas: list[Array] = []
     envelope = replace(envelope, travel_rad=TRAVEL * WAY_RAD)
     if not limits_speed(node):
-        envelope = replace(envelope, i_max_apk=envelope.i_max_apk * UNWATCHED_SHARE)
+        limit = envelope.speed_max_rad_s
+        speed = min(FASTEST * SPEED_RAD_S, limit)
+        share = within_budget(node, envelope.acceleration_rad_s2, MOST * limit - speed, UNWATCHED_S)
+        envelope = replace(envelope, speed_max_rad_s=speed, i_max_apk=share * envelope.i_max_apk)
     with changing(drive, written, envelope, say) as (guard, put):
         for forward in forwards.values():
             if forward.counts:

@@ -35,6 +35,7 @@ from pmsmtool.sim.foreign.drawn_gains import DrawnGains
 from pmsmtool.sim.foreign.drive import ForeignDrive
 from pmsmtool.sim.node.node import Node
 from pmsmtool.trace import Trace
+from pmsmtool.units import rad_s_from_rpm
 from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import COMMON, HEARTBEAT, Row, identity, write_eds
 
@@ -326,6 +327,26 @@ def test_what_scales_rest_on_is_recorded_long_and_nothing_is_changed_on_a_fit_at
     if at_bound:
         assert measured.gain_changed is None and not measured.integral_changed
         assert any("bound of the loop's lag" in note for note in measured.notes)
+
+
+@pytest.mark.parametrize("limited", [True, False])
+def test_what_runs_away_is_off_before_1_3_of_the_speed_limit(monkeypatch: pytest.MonkeyPatch, limited: bool) -> None:
+    """A free rotor of a data sheet had 3 % of its current at 0.4 of its speed, on a drive without a speed limit."""
+    for module in (learn_gains, learn_position_gain):
+        monkeypatch.setattr(module, "limits_speed", lambda node: limited)
+    source = load_machine_file("interior-2k2")
+    light = replace(source, machine=replace(source.machine, J_kgm2=1e-4))
+    drive = MagicMock(rated_apk=6.0, shows_apk=6.0)
+    made = learn_gains.learning_envelope(drive, light, None, None, "free", "none", "none")
+    top = rad_s_from_rpm(light.machine.top_rpm or 0.0)
+    emf = light.inverter.U_dc_v / math.sqrt(3.0) / (light.machine.pole_pairs * light.machine.psi_f_wb)
+    assert emf < top and made.speed_max_rad_s == pytest.approx(0.4 * top if limited else 0.8 * emf)
+    gained = (made.acceleration_rad_s2 or 0.0) * learn_gains.SEEN_S
+    ends = learn_gains.trip_share(drive.node) * made.speed_max_rad_s
+    assert (made.i_max_apk == 6.0) == limited
+    assert limited or 1.1 < (ends + gained) / made.speed_max_rad_s <= 1.3, "reluctance torque: less than in proportion"
+    slow = replace(light, machine=replace(light.machine, n_max_rpm=500.0))
+    assert learn_gains.largest_speed(drive.node, slow) == pytest.approx(rad_s_from_rpm(200.0 if limited else 400.0))
 
 
 def test_an_oscillation_trips() -> None:

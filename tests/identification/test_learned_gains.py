@@ -87,8 +87,10 @@ def test_a_response_that_does_not_follow_the_counts_decides_nothing() -> None:
     half = Observation(1400, INTEGRALS, loop(A0 * math.sqrt(0.7), A0 * RATE))
     assert "exponent 0.50" in gain_scale(base, half, ROTOR.basis, P).why
     assert gain_scale(base, None, ROTOR.basis, P).scale is None
-    wide = gain_scale(base, gain_changed, Rotor(J, 0.1, 1.0, F_S).basis, P)
+    wide = gain_scale(base, gain_changed, Rotor(J, 0.13, 1.0, F_S).basis, P)
     assert wide.scale is None and "too wide" in wide.why
+    sheet = gain_scale(base, gain_changed, Rotor(J, 0.0577, 1.0, F_S).basis, P)  # 10 % of a data sheet
+    assert sheet.scale is not None and 0.113 < sheet.half_width < 0.13
 
 
 def test_an_integral_that_moves_the_gain_too_is_not_one() -> None:

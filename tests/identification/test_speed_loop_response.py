@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +16,11 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.identification.speed_loop_response import (
     AT_BOUND_S,
     LEAST_LAG_S,
+    MOST_LEFT,
     Emf,
     SpeedLoop,
     StepRecord,
+    _weighted,
     fit_pulses,
     fit_speed_loop,
     phase_margin_rad,
@@ -143,3 +147,10 @@ def test_torque_pulses_show_what_emf_and_dead_time_take() -> None:
 )
 def test_pulses_that_are_none_show_nothing(shown: list[tuple[Array, Array]], assumed: Emf) -> None:
     assert fit_pulses(shown, assumed) is None
+
+
+def test_a_loop_that_is_not_stable_ends_no_fit() -> None:
+    """Its speed overflows on a long record: `map learn` of a light rotor ended with a traceback."""
+    model: Any = SimpleNamespace(fitted=lambda p: (np.array([math.inf, math.nan]), np.array([-1e300, 2.0]), 1.0, 1.0))
+    left = _weighted(model, np.zeros(5), (1.0, 2.0))
+    assert left.tolist() == [MOST_LEFT, MOST_LEFT, -MOST_LEFT, 1.0] and math.isfinite(float(left @ left))
