@@ -55,7 +55,7 @@ IDENTIFY_TIMES = 4
     epilog=examples(
         "pmsmtool -n 5 move --by 90deg --map epos4 --shaft coupled",
         "pmsmtool -n 5 move --by 0.4rad --design axis.toml --flash --map epos4",
-        "pmsmtool -n 5 move --by 90deg --speed 200rpm --acceleration 400 --map epos4",
+        "pmsmtool -n 5 move --by 90deg --speed 200rpm --acceleration 4000rpm/s --map epos4",
     ),
 )
 @click.option("--by", "way_rad", type=Quantity("angle"), required=True, metavar="ANGLE", help="Way of the shaft there "
@@ -65,8 +65,8 @@ IDENTIFY_TIMES = 4
 @click.option("--flash", is_flag=True, help="With --design: then write its values, once you agree to their list, and "
               "move again. One consent is for both moves.")  # fmt: skip
 @click.option("--speed", "speed_rad_s", type=SPEED, help="Speed of the move.  [default: as the drive holds it]")
-@click.option("--acceleration", type=float, metavar="RAD/S2", help="Acceleration of the move.  [default: as the drive "
-              "holds it]")  # fmt: skip
+@click.option("--acceleration", type=Quantity("angular acceleration", positive=True, bare=True), metavar="ACCELERATION",
+              help="Acceleration of the move, e.g. 3000rpm/s.  [default: as the drive holds it]")  # fmt: skip
 @click.option("--identify", "machine", metavar="MACHINE", help="Find inertia and friction of this machine (a machine "
               "file) from the moves.")  # fmt: skip
 @new_file("path", help="Machine file to write with what --identify found.  [default: machine.toml of the run]")

@@ -82,11 +82,12 @@ class Quantity(click.ParamType[float]):
         """Return the SI value (A peak for a current), or fail as a usage error."""
         if isinstance(value, float):
             return value
+        found = math.nan
         if self.bare:
             with contextlib.suppress(ValueError):
-                return float(value)
+                found = float(value)
         try:
-            found = parse_quantity(str(value), self.dimension)
+            found = found if math.isfinite(found) else parse_quantity(str(value), self.dimension)
         except ConfigError as error:
             self.fail("; ".join(part for part in (error.what, error.likely, error.hint) if part), param, ctx)
         if self.positive and not found > 0.0:

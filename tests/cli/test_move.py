@@ -28,7 +28,7 @@ from tests.foreign.data_sheets import COMMON, HEARTBEAT, Row, epos4, faulhaber, 
 POSITION: tuple[Row, ...] = (
     (0x1010, 1, "U32", "rw", "1"), (0x6062, 0, "I32", "ro", "0"), (0x607A, 0, "I32", "rw", "0"),
 )  # fmt: skip
-ASKED = ("--by", "60deg", "--speed", "300rpm", "--acceleration", "300", "--settle", "0.2s", "--map", "epos4",
+ASKED = ("--by", "60deg", "--speed", "300rpm", "--acceleration", "300rad/s2", "--settle", "0.2s", "--map", "epos4",
          "--yes", "--json")  # fmt: skip
 J = 0.015
 MOST = 0.5
