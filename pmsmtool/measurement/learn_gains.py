@@ -17,7 +17,7 @@ from pmsmtool.drive.motion_objects import limits_speed
 from pmsmtool.drive.port import Excitation, Injection, Shape
 from pmsmtool.drive.speed_loop_drive import SpeedLoopDrive
 from pmsmtool.errors import IdentificationError, SafetyRefusal
-from pmsmtool.identification.asked_current import asked_share, fit_asked_current, shows_asked
+from pmsmtool.identification.asked_current import asked_share, fit_asked_current, held_apart, shows_asked
 from pmsmtool.identification.learned_gains import NO_DOUBT, Observation, emf_doubt, lag_doubt
 from pmsmtool.identification.speed_loop_response import (
     Emf,
@@ -275,6 +275,7 @@ class _Learner:
         self.bandwidth, self.hold_s, self.settle_s = FIRST_BANDWIDTH, HOLD_TIMES / FIRST_BANDWIDTH, SETTLE_S
         self.notes: list[str] = []
         self.shares: list[float] = []
+        self.apart = 0.0
         self.asks = False
         self.step_current_a = 0.0, math.inf
 
@@ -435,7 +436,8 @@ class _Learner:
             model_std = K_p, K_i, rate
         if lag_s is None:
             self.shares.append(asked_share(record, loop, self.emf))
-            self.asks = shows_asked(self.shares, self.emf)
+            self.apart = max(self.apart, held_apart(record))
+            self.asks = shows_asked(self.shares, self.emf, self.apart)
         asked = fit_asked_current(record, loop) if self.asks else None
         peak = float(np.abs(record.current_a).max())
         share = peak / self.drive.rated_apk

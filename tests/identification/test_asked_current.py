@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pmsmtool.identification.asked_current import asked_share, fit_asked_current, shows_asked
+from pmsmtool.identification.asked_current import asked_share, fit_asked_current, held_apart, shows_asked
 from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop, StepRecord
 from pmsmtool.measurement.learn_gains import TICK_S, staircase
 
@@ -70,3 +70,18 @@ def test_records_together_say_whether_a_current_is_asked_for() -> None:
     """Of one drive at 0.17 of its rated current two records gave these: the second one alone is none."""
     assert shows_asked([0.085, -0.037], Emf(0.052, 71.0))
     assert not shows_asked([0.03, -0.042], Emf(0.052, 71.0)) and not shows_asked([math.nan, 0.1], EMF)
+
+
+def test_the_emf_of_a_light_rotor_is_told_from_another_unit_at_a_held_speed() -> None:
+    """It takes half of the current of its steps: more than peak over rms. At a held speed it takes none."""
+    t = np.linspace(0.0, 1.0, 1001)
+    noise = np.random.default_rng(2).normal(0.0, 0.01, t.size)
+    record = StepRecord(t, t, 0.1 + noise, [(0.0, 1.0), (0.5, 2.0)], [(0.5, 1.0)], 1e-4, 0.01, np.full_like(t, 0.1))
+    assert held_apart(record) < 0.02
+    assert held_apart(replace(record, asked_a=np.full_like(t, 0.1 * math.sqrt(2.0)))) == pytest.approx(0.414, abs=0.02)
+    for none in (replace(record, current_a=noise), replace(record, asked_a=None)):
+        assert math.isinf(held_apart(none)), "too little current, or only one of them"
+    light = Emf(0.65, 119.0)
+    assert shows_asked([0.31, 0.51], light, held_apart(record))
+    assert not shows_asked([0.31, 0.51], light, 0.414) and not shows_asked([0.31, 0.51], light)
+    assert not shows_asked([0.05, 0.08], light, held_apart(record)), "both may be the current that flows"
