@@ -187,6 +187,12 @@ def of_axis(item: DriveObject, axis: int) -> DriveObject:
     return replace(item, index=item.index + (axis - 1) * AXIS_STEP)
 
 
+def on_first_axis(index: int) -> int:
+    """Return the index that an object of a further axis has on the first one; any other index as it is."""
+    first = 0x6000
+    return first + (index - first) % AXIS_STEP if first <= index < first + LAST_AXIS * AXIS_STEP else index
+
+
 def signal_unit(name: str) -> str:
     """Return the unit of a signal from its suffix, ``1`` where it has none."""
     return next((unit for suffix, unit in _SUFFIX_UNITS if name.endswith(suffix)), "1")

@@ -86,7 +86,7 @@ def kept_objects(listed: Iterable[Listed]) -> tuple[tuple[Listed, ...], dict[str
     """
     kept, left_out = [], {}
     for item in listed:
-        reason = _BY_INDEX.get(item.index, "") or ("" if item.copied else _FLAGGED)
+        reason = _BY_INDEX.get(objects.on_first_axis(item.index), "") or ("" if item.copied else _FLAGGED)
         if not reason and item.index >= OWN_MAKERS:
             reason = next((why for pattern, why in _BY_NAME if pattern.search(item.name)), "")
         if reason:

@@ -100,6 +100,10 @@ def test_commands_set_points_and_what_is_of_one_device_are_left_out() -> None:
     assert not kept and "ObjFlags" in left_out["0x2706:01 Save all Parameters"], "one maker's own save command"
     commands = (0x1003, 0x1010, 0x1011, 0x1013, 0x1023, 0x1026, 0x6040)
     assert not kept_objects(Listed(index, 1, "object") for index in commands)[0]
+    # of the second and the last axis: a torque and a brake's output were saved, and restored into a spare part
+    further = [index + axis * 0x800 for index in (0x6040, 0x6071, 0x607A, 0x60FE, 0x60FF) for axis in (1, 7)]
+    kept, left_out = kept_objects(Listed(index, 1, "object") for index in (*further, 0x6873, 0xA071))
+    assert [item.index for item in kept] == [0x6873, 0xA071] and len(left_out) == len(further)
 
 
 def test_a_spare_part_holds_all_of_it(tmp_path: Path) -> None:
