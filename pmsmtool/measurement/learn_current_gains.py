@@ -71,6 +71,8 @@ START_TICKS = 7
 VOLTAGE_SHARE = 0.8
 """What a step may take of the voltage that EMF and resistance leave. A step that reaches the limit lacks some voltage
 for a few periods: K_p came out 4.5 % too small."""
+LEAST = 0.1
+"""Smallest size of the steps that voltage leaves: less shows nothing."""
 RECORDS = 10
 """Records of one setting; of steps of half the size twice as many, as what the output is counted in is as large."""
 UNEVEN = 0.1
@@ -238,27 +240,30 @@ class _CurrentLearner:
         return min(self.guard.envelope.i_max_apk, self.drive.current_limit_apk, self.drive.rated_apk)
 
     def _within_voltage(self, loop: CurrentLoop) -> float:
-        """Return the size of the steps at which the loop does not reach its voltage limit."""
+        """Return the size of the steps at which the loop does not reach its voltage limit, and no less than LEAST."""
         winding, largest = self.winding, self._largest_a()
-        emf = winding.emf_vs_per_rad * high_share(self.drive.node) * self.guard.envelope.speed_max_rad_s
+        emf = winding.emf_vs_per_rad * max(map(abs, self._reference(1.0)))
         left = VOLTAGE_SHARE * (winding.U_max_v - emf - winding.R_ohm * max(LEVELS) * largest)
-        return min(1.0, max(0.0, left) / (loop.K_p_per_L * winding.L_h * STEP * largest))
+        return min(1.0, max(LEAST, left / (loop.K_p_per_L * winding.L_h * STEP * largest)))
 
-    def _record(self, size: float) -> CurrentSteps:
-        """Record the current while the speed rises through zero, in steps of the asked current."""
-        guard, drive, loop = self.guard, self.drive, self.speed_loop
-        limit = guard.envelope.speed_max_rad_s
-        ticks = LEAD_TICKS + START_TICKS + math.ceil(self.rows * self.period_s / TICK_S)
-        per_ampere = size * self.size * self._largest_a() / abs(loop.amps_per_rad_s2)
+    def _reference(self, size: float) -> list[float]:
+        """Return the speeds (rad/s) that ask for the levels, a tick each, on a shaft that follows them freely."""
+        loop, ticks = self.speed_loop, LEAD_TICKS + START_TICKS + math.ceil(self.rows * self.period_s / TICK_S)
+        per_ampere = size * self._largest_a() / abs(loop.amps_per_rad_s2)
+        top = high_share(self.drive.node) * self.guard.envelope.speed_max_rad_s
         speeds, free = [], 0.0
         for k in range(ticks):
             asked = per_ampere * LEVELS[(max(k, LEAD_TICKS) - LEAD_TICKS + 1) % len(LEVELS)]
             speeds.append(free + asked / loop.K_p_per_J)
             free += asked * TICK_S
-        share = min(1.0, 2.0 * high_share(drive.node) * limit / max(speeds))
-        low = -0.5 * share * max(speeds)
-        speeds = [low + share * speed for speed in speeds]
-        guard.command_speed(low)
+        share = min(1.0, 2.0 * top / max(speeds))
+        return [share * (speed - 0.5 * max(speeds)) for speed in speeds]
+
+    def _record(self, size: float) -> CurrentSteps:
+        """Record the current while the speed rises through zero, in steps of the asked current."""
+        guard, drive = self.guard, self.drive
+        speeds = self._reference(size * self.size)
+        guard.command_speed(-max(speeds))
         guard.wait(SETTLE_S)
         drive.starts_s = LEAD_TICKS * TICK_S
         drive.starts = lambda: self.recorder.arm(self.signals, self.rows, 1, 0, at_excitation=False)

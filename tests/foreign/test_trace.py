@@ -228,9 +228,10 @@ def test_steps_are_as_large_as_the_voltage_lets_them() -> None:
     """24 V and 4.9 V/A: steps of 2.1 A reached the limit in 0.3 % of the samples, and K_p came out 4.5 % too small."""
     learner = object.__new__(learn_current_gains._CurrentLearner)
     learner._largest_a = lambda: 7.0  # type: ignore[method-assign]
-    learner.guard = SimpleNamespace(envelope=SimpleNamespace(speed_max_rad_s=100.0))  # type: ignore[assignment]
+    learner._reference = lambda size: [-70.0, 70.0]  # type: ignore[method-assign]
     loop = CurrentLoop(4.9 / 5.5e-4, 150.0, 1.0, 0.01)
-    for U_dc, wanted in ((24.0, 0.8 * (24.0 / math.sqrt(3.0) - 3.5 - 0.588) / (4.9 * 0.275 * 7.0)), (325.0, 1.0)):
+    fits = 0.8 * (24.0 / math.sqrt(3.0) - 3.5 - 0.588) / (4.9 * 0.275 * 7.0)
+    for U_dc, wanted in ((24.0, fits), (325.0, 1.0), (5.0, learn_current_gains.LEAST)):
         learner.winding = Winding(5.5e-4, 0.005, 0.12, U_dc / math.sqrt(3.0), 0.05)
         assert learner._within_voltage(loop) == pytest.approx(wanted)
     learner.winding = Winding(5.5e-4, 0.005, 0.12)
