@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import struct
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -95,11 +96,16 @@ class DriveNode:
 
     def close(self) -> None:
         """Stop listening to the node; whoever closes the bus does it, too. Once."""
-        with contextlib.ExitStack() as last:
-            last.callback(self.supervision.close)
-            last.callback(self.sdo.close)
-            while self.before_close:
-                last.callback(self.before_close.pop(0))
+        ended_by = sys.exc_info()[1]
+        try:
+            with contextlib.ExitStack() as last:
+                last.callback(self.supervision.close)
+                last.callback(self.sdo.close)
+                while self.before_close:
+                    last.callback(self.before_close.pop(0))
+        except BusError:  # never in place of what ended it: that the drive may still be energised
+            if ended_by is None:
+                raise
 
     # ---- objects --------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from pmsmtool.bus.abort_codes import AbortCode
-from pmsmtool.bus.connect import Connection
+from pmsmtool.bus.connect import Connection, connect
 from pmsmtool.bus.supervision import Emergency
 from pmsmtool.cia402 import EXCITATION_ABORTED, Command, State
 from pmsmtool.drive import objects, stop
@@ -19,7 +19,7 @@ from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.drive_maps.identity_rows import IdentityRows
 from pmsmtool.drive_maps.motion_objects import MotionObject
 from pmsmtool.drive_maps.shipped_maps import load_family
-from pmsmtool.errors import DriveFault, DriveTimeout, NotAvailable, SdoAbort, StopNotConfirmed
+from pmsmtool.errors import BusError, DriveFault, DriveTimeout, NotAvailable, SdoAbort, StopNotConfirmed
 from tests.bus.scripted import NODE, ScriptedBus
 from tests.drive.table_drive import TableDrive, node_of
 
@@ -446,3 +446,25 @@ def test_an_excitation_ends_and_set_points_are_zero_on_the_reference_drive(vendo
         stop.zero_references(node)
         left = [table.number(item) for item in held]
         assert left == ([0.0, 0.0, 0.0] if ended else [2.0, 1.5, -2.5])
+
+
+@pytest.mark.parametrize("by_itself", [True, False])
+def test_what_fails_at_the_close_does_not_hide_that_a_drive_may_be_energised(by_itself: bool) -> None:
+    """Exit code 3 and "the adapter is gone" took the place of 8 and the hardware stop, where process data were lent."""
+
+    def gone() -> None:
+        raise BusError("the adapter is gone")
+
+    for ended in (StopNotConfirmed("the drive may still be energised"), None):
+        with (
+            pytest.raises(BusError if ended is None else StopNotConfirmed),
+            connect("pmsmsim", "interior-2k2?nv=:memory:") as connection,
+        ):
+            node = DriveNode(connection, 1)
+            node.before_close.append(gone)
+            try:
+                if ended is not None:
+                    raise ended
+            finally:
+                if by_itself:
+                    node.close()
