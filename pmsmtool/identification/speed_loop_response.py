@@ -329,7 +329,7 @@ def _weighted(model: _Model, p: Array, weights: Sequence[float]) -> Array:
     with np.errstate(over="ignore", invalid="ignore"):  # a loop that is not stable leaves everything
         position, current, _, _ = model.fitted(p)
         found = np.concatenate([position / weights[0], current / weights[1]])
-    return np.clip(np.nan_to_num(found, nan=MOST_LEFT), -MOST_LEFT, MOST_LEFT)
+    return np.asarray(np.clip(np.nan_to_num(found, nan=MOST_LEFT), -MOST_LEFT, MOST_LEFT))
 
 
 def _solve(model: _Model, first: Array, weights: Sequence[float]) -> Array:
