@@ -23,7 +23,8 @@ move.
 
 Families whose gains have no published unit are nodes of a ``--table`` (``sim/foreign/file_rows.py``) with gains that a
 seed drew for the motor alone (``sim/foreign/drawn_gains.py``). There `map learn` comes first, on the uncoupled motor;
-the other commands take the map that it wrote.
+the other commands take the map that it wrote. A Faulhaber has the objects of its position gain besides
+(:data:`MORE_OBJECTS`), and a motor of two pole pairs: it commutates no more.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from pmsmtool.cli import consent
 from pmsmtool.commissioning.axis_design import design_axis
 from pmsmtool.design.design_file import Design
 from pmsmtool.design.tune_request import TuneRequest
+from pmsmtool.drive.guard import GuardedDrive
 from pmsmtool.drive.port import Excitation, Injection, ProfileMove, Shape
 from pmsmtool.drive_maps.drive_map import reference_map
 from pmsmtool.errors import DesignInfeasible
@@ -93,6 +95,19 @@ def loaded(seed: int) -> tuple[MachineFile, MachineFile]:
     return replace(described, simulation={**base.simulation, **settings}), described
 
 
+def fitting(file: MachineFile, family: str) -> MachineFile:
+    """Return a machine as the family's drive can commutate it, with the same torque per ampere, and its encoder."""
+    if family not in MORE_OBJECTS:
+        return file
+    psi_f_wb = file.machine.psi_f_wb * file.machine.pole_pairs / TWO_PAIRS
+    return replace(
+        file, machine=replace(file.machine, pole_pairs=TWO_PAIRS, psi_f_wb=psi_f_wb),
+        encoder=replace(file.encoder, bits=OWN_BITS), simulation={**file.simulation, "encoder_bits": OWN_BITS},
+        std={name: std * psi_f_wb / file.machine.psi_f_wb if name == "psi_f_wb" else std
+             for name, std in file.std.items()},
+    )  # fmt: skip
+
+
 def uncoupled(truth: MachineFile) -> MachineFile:
     """Return the motor alone, its inertia known to :data:`STD`."""
     load = ("J_load_kgm2", "coupling_stiffness_nm_per_rad", "coupling_damping_nms_per_rad", "backlash_rad")
@@ -125,6 +140,16 @@ LEARNED = {
     "faulhaber": "faulhaber",
 }  # fmt: skip
 """Map of the families of a table whose gains `map learn` must find first."""
+MORE_OBJECTS = {
+    "faulhaber": (
+        (0x2332, 1, "Position Control Parameter Set: Proportional Term PP"),
+        (0x2332, 2, "Position Control Parameter Set: Derivative Term PD"),
+    )
+}
+"""Objects that the table lacks: UNSIGNED16, 1 to 255, in the EDS of newer firmware (rauc-lab/being MCLM3002P-CO.eds).
+"""
+TWO_PAIRS, OWN_BITS = 2, 12
+"""Pole pairs (0x2350:03 takes 2 to 4 poles) and encoder (0x608F is 4096 and fixed) of a Faulhaber's motor."""
 UNABLE = ("following error", "speed", "travel")
 """Limits that end a move which the stored gains cannot do: the shaft swings, or comes no nearer. Its ratio is 0."""
 SHARE_OF_ACCELERATION, FASTEST = 0.5, 300.0
@@ -135,8 +160,19 @@ PROMPTS = {"motion": 0, "writing": 0}
 """How often consent was asked for since :func:`count_prompts`; ``--yes`` answers."""
 
 
+GUARDS: list[GuardedDrive] = []
+"""Of the drives that were energised since they were last forgotten; each knows for how long."""
+
+
 def count_prompts() -> None:
-    """Count what the commands ask a person for."""
+    """Count what the commands ask a person for, and how long they energise a drive."""
+    made = GuardedDrive.__init__
+
+    def kept(guard: GuardedDrive, *given: Any, **options: Any) -> None:
+        made(guard, *given, **options)
+        GUARDS.append(guard)
+
+    GuardedDrive.__init__ = kept  # type: ignore[method-assign, assignment]
     for subject, question in (("motion", consent.ask_motion), ("writing", consent.ask_writing)):
 
         def counted(*given: Any, subject: str = subject, question: Any = question, **options: Any) -> Any:
@@ -164,7 +200,9 @@ def learned(family: str, channel: str) -> None:
     """Learn the gains of the uncoupled motor's drive into ``mine.toml``, as a person does."""
     drive = ("--map", LEARNED[family], "--sim", channel)
     learn = ("map", "learn", *GAINS, "--machine", "motor.toml", "-o", "mine.toml", "--shaft", "free", "--yes")
+    GUARDS.clear()
     gains = [gain for gain in done(*learn, *drive)["gains"] if gain["name"] in GAINS]
+    print(f"map learn energised the drive for {sum(guard.energised_s for guard in GUARDS):.0f} s; ", end="")
     unknown = [f"{gain['name']}: {gain['why']}" for gain in gains if gain["scale"] is None]
     if unknown:
         raise RuntimeError(f"map learn: not decided: {'; '.join(unknown)}")
@@ -180,15 +218,20 @@ def compared_on(family: str, seed: int, table: str) -> tuple[float, float, float
     RuntimeError
         A command ended with an error, or a gain stayed unknown.
     """
-    truth, known = loaded(seed)
+    truth, known = (fitting(file, family) for file in loaded(seed))
     PROMPTS.update(motion=0, writing=0)
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         os.environ["PMSMTOOL_HOME"] = folder
         Path("truth.toml").write_text(dump_machine_file(truth), encoding="utf-8")
         Path("known.toml").write_text(dump_machine_file(known), encoding="utf-8")
+        if family in MORE_OBJECTS:
+            more = (f"{family},,0x{index:04X},{sub},{name},UNSIGNED16,rww,,1,255\n"
+                    for index, sub, name in MORE_OBJECTS[family])  # fmt: skip
+            Path("objects.csv").write_text(Path(table).read_text(encoding="utf-8") + "".join(more), encoding="utf-8")
+            table = "objects.csv"
         node = f"eds={table}#{family}&gains={seed}" if family in LEARNED else f"drive={family}"
-        node += f"&nv=drive.nv&encoder_bits={ENCODER_BITS}"
+        node += f"&nv=drive.nv&encoder_bits={known.encoder.bits or ENCODER_BITS}"
         used = family
         if family in LEARNED:
             Path("motor.toml").write_text(dump_machine_file(uncoupled(truth)), encoding="utf-8")

@@ -193,7 +193,10 @@ def _learn(
 
     drive.live = live  # type: ignore[method-assign]
     try:
-        measured = learn_speed_loop(drive, gain, integral, envelope, emf_of(told), lambda text: None)
+        measured = learn_speed_loop(
+            drive, gain, integral, envelope, emf_of(told), lambda text: None,
+            lambda measured: all(one.scale is not None for one in learned_gains(told, measured).values()),
+        )  # fmt: skip
     finally:
         result.over_speed = largest > OVER * envelope.speed_max_rad_s
     for note in measured.notes:

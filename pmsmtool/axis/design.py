@@ -11,6 +11,7 @@ import numpy as np
 
 from pmsmtool.axis.drive import (
     CASCADE,
+    DERIVATIVE,
     LEAD,
     NOTCH,
     PID,
@@ -25,7 +26,7 @@ from pmsmtool.axis.drive import (
     from_pid,
 )  # fmt: skip
 from pmsmtool.axis.loops import AxisGains, AxisPath, Lifted, best_share, following_error
-from pmsmtool.axis.move import Move, Profile, jerk_limited, plan
+from pmsmtool.axis.move import Move, Profile, followed, jerk_limited, plan
 from pmsmtool.axis.search import Box, Judged, Limits, stiffest
 from pmsmtool.design.design_file import Design, DesignValue, Scalar
 from pmsmtool.design.ratings import ratings_of
@@ -101,7 +102,11 @@ def own_move(design: Design, drive: AxisDrive) -> Move:
     speed, acceleration, jerk = (
         float(design.facts[f"axis_{name}"]) for name in ("speed_rad_s", "acceleration_rad_s2", "jerk_rad_s3")
     )
-    return plan(WAY_RAD, Profile(speed, acceleration, jerk if drive.jerks else math.inf))
+    return _move(Profile(speed, acceleration, jerk), drive)
+
+
+def _move(profile: Profile, drive: AxisDrive) -> Move:
+    return plan(WAY_RAD, profile if drive.jerks else replace(profile, jerk=math.inf))
 
 
 def move_peaks(
@@ -157,6 +162,24 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
     elif drive.torque_nm is None and not drive.own_core:
         notes = (*notes, "the drive's own current limit is not known (--stored): the move is for that of the machine")
     profile = profile_of(design, shaft, position, path.T, torque)
+    friction_rad = (source.machine.tau_c_nm or 0.0) / position.pid[0]
+
+    def behind(limits: Profile) -> float:
+        return best_forward(box, position, _move(limits, drive), drive)[1] + friction_rad
+
+    far = behind(profile)
+    if far > WAY_RAD:
+        raise DesignInfeasible(
+            f"with margins over the tolerance box a move of half a turn stays {math.degrees(far):.3g} deg behind",
+            where="axis", likely="a resonance that is little damped, or of an unknown damping, without a notch",
+            hint=filtered or "measure it with `identify frf`, ask for smaller margins, or keep the drive's own gains",
+        )  # fmt: skip
+    slow = followed(WAY_RAD, profile, behind)
+    if slow is not None and slow != profile:
+        share = slow.speed / profile.speed
+        notes = (*notes, f"the move has {share:.2g} of the speed and acceleration that voltage and torque allow: with "
+                         f"those the shaft would stay {math.degrees(far):.3g} deg behind")  # fmt: skip
+        profile = slow
     unknown = [case.shaft.resonance_hz for case in box.cases if case.shaft is not None]
     if unknown:
         swings = f"the shaft has play, or is not rigid: it may swing from {min(unknown):.3g} to {max(unknown):.3g} Hz"
@@ -195,15 +218,8 @@ def with_axis(design: Design, request: AxisRequest, drive: AxisDrive) -> AxisDes
     predicted: dict[str, Scalar] = {
         "axis_inertia_ff_share": share,
         "axis_following_error_rad": error,
-        "axis_friction_error_rad": (source.machine.tau_c_nm or 0.0) / position.pid[0],
+        "axis_friction_error_rad": friction_rad,
     }
-    behind = error + float(predicted["axis_friction_error_rad"])
-    if behind > WAY_RAD:
-        raise DesignInfeasible(
-            f"with margins over the tolerance box a move of half a turn stays {math.degrees(behind):.3g} deg behind",
-            where="axis", likely="a resonance that is little damped, or of an unknown damping, without a notch",
-            hint=filtered or "measure it with `identify frf`, ask for smaller margins, or keep the drive's own gains",
-        )  # fmt: skip
     base = replace(base, facts={**base.facts, **predicted})
     values = axis_values(source, speed, position, share, profile, drive, how)
     return AxisDesign(judged_design(base, values, box, speed, position), box, speed, position)
@@ -330,6 +346,7 @@ def axis_values(
         CASCADE[1]: DesignValue(1.0, "the whole speed of the reference"),
         CASCADE[2]: DesignValue(inertia_share * J, forward),
         LEAD: DesignValue(inertia_share * J / position.K_p, forward),
+        DERIVATIVE: DesignValue(0.0, "as little as the drive's object takes"),
         PID[0]: DesignValue(K_P, how, POSITION_LOOP),
         PID[1]: DesignValue(K_I, how, POSITION_LOOP),
         PID[2]: DesignValue(K_D, how, POSITION_LOOP),

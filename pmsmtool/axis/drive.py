@@ -28,6 +28,8 @@ PID = (
 )  # fmt: skip
 LEAD = "position.acceleration_ff_s"
 """Feed-forward of the acceleration that is added to the reference of the speed, not to the torque (Copley)."""
+DERIVATIVE = "position.derivative_share"
+"""Derivative part beside a position gain (Faulhaber): as small as its object lets it be, for no loop here has one."""
 SPEED = ("speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad")
 SPEED_FORWARD = ("speed.inertia_ff_kgm2", "speed.friction_ff_nms_per_rad")
 NOTCH = ("speed.notch_hz", "speed.notch_zeta_num", "speed.notch_zeta_den")
@@ -35,7 +37,7 @@ PROFILE = (
     "reference.profile_speed_rpm", "reference.profile_acceleration_rpm_per_s",
     "reference.profile_deceleration_rpm_per_s", "reference.profile_jerk_rpm_per_s2",
 )  # fmt: skip
-AXIS_GAINS = (*SPEED, *SPEED_FORWARD, *CASCADE[:2], *PID[:3], CASCADE[2], LEAD, PID[3])
+AXIS_GAINS = (*SPEED, *SPEED_FORWARD, *CASCADE[:2], *PID[:3], CASCADE[2], LEAD, DERIVATIVE, PID[3])
 CURRENT = ("current.K_p_q_v_per_a", "current.K_i_q_v_per_as")
 """Gains of the loop below, which the set of an axis does not write."""
 AXIS_ROWS = frozenset((TORQUE_PER_AMPERE, INCREMENTS, *AXIS_GAINS, *NOTCH, *PROFILE))

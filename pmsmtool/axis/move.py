@@ -9,7 +9,7 @@ over one period of the swing (N. C. Singer, W. P. Seering, J. Dyn. Sys. Meas. Co
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,6 +43,35 @@ class Profile:
             raise ConfigError(
                 "a move needs positive limits", where="profile", hint="give a positive number", violations=wrong
             )
+
+    def slower(self, share: float) -> Profile:
+        """Return a share of every limit: ramps of the acceleration take the same time."""
+        return Profile(share * self.speed, share * self.acceleration, share * self.jerk)
+
+
+ENDED = 0.5
+"""Following error at which a move is ended, of its way."""
+KEPT_FROM_IT = 0.9
+"""Largest predicted following error of a move, of the one that ends it."""
+SLOWEST, STEP = 0.02, 0.95
+"""Least share of the limits that is tried for that; every further one is at most this share of the last."""
+
+
+def followed(
+    way_rad: float, profile: Profile, error_rad: Callable[[Profile], float], slowest: float = SLOWEST
+) -> Profile | None:
+    """Return limits of a move, so slow that its following error does not end it; None where none are slow enough.
+
+    ``error_rad`` says the predicted following error (rad) with some limits; ``slowest``: least share that is tried.
+    """
+    share, most = 1.0, KEPT_FROM_IT * ENDED * abs(way_rad)
+    while share > slowest:
+        slower = profile if share == 1.0 else profile.slower(share)
+        error = error_rad(slower)
+        if error <= most:
+            return slower
+        share *= min(most / error, STEP) if math.isfinite(error) else 0.0
+    return None
 
 
 @dataclass(frozen=True, slots=True)

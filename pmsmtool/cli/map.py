@@ -76,7 +76,7 @@ def learn_command(
     from pmsmtool.measurement.changed_gains import GAIN, INTEGRAL, gain_address, gain_object, refuse_unsafe
     from pmsmtool.measurement.learn_current_gains import current_gain_objects, learn_current_gains
     from pmsmtool.measurement.learn_gains import learn_speed_loop, learning_envelope
-    from pmsmtool.measurement.learn_position_gain import FORWARDS, POSITION, learn_position_gain, position_gain_objects
+    from pmsmtool.measurement.learn_position_gain import BESIDE, POSITION, learn_position_gain, position_gain_objects
     from pmsmtool.measurement.learned_rows import emf_of, learned_gains, winding_of
 
     asked = _addresses(names)
@@ -104,13 +104,17 @@ def learn_command(
             *envelope.lines(),
             *unlike_stated(node),
             "the shaft turns at up to 70 % of the speed limit, both ways; its own speed loop takes steps",
-            *(["then its position loop moves it by three turns, 23 times at most"] if POSITION in found else []),
+            *(["then its position loop moves it by up to five turns, 25 times at most"] if POSITION in found else []),
             *(f"{gain.name} in {gain.address} holds {gain.counts:.9g}: it is changed while the voltage is off, and "
               "restored" for gain in found.values()),
             "nothing is stored in the drive; every changed object is restored",
         ]  # fmt: skip
         ask_motion(lines, motion, simulated=bus.simulated(), serial=drive.identity.serial, out=out)
-        measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, emf_of(file), out.note)
+
+        def decided(measured: LearnedLoop) -> bool:
+            return all(gain.scale is not None for gain in learned_gains(file, measured).values())
+
+        measured = learn_speed_loop(drive, found[GAIN], found[INTEGRAL], envelope, emf_of(file), out.note, decided)
         results, loop = learned_gains(file, measured), measured.base[0].loop
         of_currents, stopped = learn_current_gains(drive, found, envelope, loop, winding_of(file), out.note)
         results |= of_currents
@@ -120,7 +124,7 @@ def learn_command(
         drive.close()
     for note in measured.notes:
         out.warn(note)
-    told = {name: results[name] for name in (*asked, *FORWARDS) if name in results}
+    told = {name: results[name] for name in (*asked, *BESIDE) if name in results}
     _tell(file, drive, measured, found, told, output, out, stopped)
 
 

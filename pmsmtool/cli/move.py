@@ -41,7 +41,6 @@ from pmsmtool.files import write_file
 if TYPE_CHECKING:
     from pmsmtool.cli.consent import Consent
     from pmsmtool.commissioning.move import PlannedMove
-    from pmsmtool.drive.position_drive import PositionDrive
     from pmsmtool.drive_maps.drive_map import DriveMap
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.machine.parameters import Estimate
@@ -116,7 +115,7 @@ def move_command(
         plan_move, allowed=allowed, way_rad=way_rad, times=times or (1 if source is None else IDENTIFY_TIMES),
         design=None if design is None else load_design(design), speed_rad_s=speed_rad_s, acceleration=acceleration,
     )  # fmt: skip
-    moves = _Moves(bus, motion, out, runs, drive_map, plan, settle_s, {})
+    moves = _Moves(bus, motion, out, runs, drive_map, plan, settle_s, {}, [])
     if design is None or not flash:
         data = moves.make(source, path)
         out.result("move", data, lambda: [*_lines(data), *_told(data["identified"])])
@@ -150,9 +149,11 @@ class _Moves:
     out: Output
     runs: Path
     drive_map: DriveMap
-    plan: Callable[[PositionDrive], PlannedMove]
+    plan: Callable[..., PlannedMove]
     settle_s: float
     agreed: dict[object, Consent]
+    planned: list[PlannedMove]
+    """The moves so far: each is as the first."""
 
     def make(
         self, source: MachineFile | None = None, path: Path | None = None, then: Sequence[str] = ()
@@ -171,7 +172,8 @@ class _Moves:
         with self.bus.connect() as connection:
             drive = PositionDrive(connection, claimed_node(connection, self.bus.node), drive_map=self.drive_map)
             check_motion(drive.node.map, drive.identity)
-            planned = self.plan(drive)
+            planned = self.plan(drive, like=self.planned[0] if self.planned else None)
+            self.planned.append(planned)
             serial, foretold = drive.identity.serial, planned.foretold
             about = serial, planned.envelope, tuple(planned.lent.items()), planned.find
             if about not in self.agreed:  # one consent is for both moves, and for nothing else

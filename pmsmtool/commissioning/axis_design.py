@@ -15,6 +15,7 @@ from pmsmtool.axis.design import with_axis
 from pmsmtool.axis.drive import (
     AXIS_ROWS,
     CASCADE,
+    DERIVATIVE,
     LEAD,
     PID,
     SPEED,
@@ -247,6 +248,9 @@ def design_axis(
     notes = tuple(f"not written: {name}: {why}" for name, why in lacking.items())
     wanted = axis_parameters(made.design)
     fitting = dict(wanted.values)
+    if DERIVATIVE in fitting:
+        part = drive_map.cells[DERIVATIVE]
+        fitting[DERIVATIVE] = max(part.low, 0.0) * part.factor
     for group in GROUPS:
         fitting |= _slowed(drive_map, group, wanted)
     if CASCADE[0] in fitting and fitting.get(SPEED[0], 0.0) > 0.0:  # no faster than the speed loop below it

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pmsmtool.axis.design import move_peaks, profile_within
 from pmsmtool.axis.drive import CURRENT, PROFILE, AxisRequest, axis_path, cases, held_loop
 from pmsmtool.axis.loops import AxisGains, bandwidth
-from pmsmtool.axis.move import UNITS, MoveResult, Profile, move_result, plan, shown
+from pmsmtool.axis.move import ENDED, UNITS, MoveResult, Profile, followed, move_result, plan, shown
 from pmsmtool.axis.search import Box
 from pmsmtool.commissioning.axis_design import axis_drive
 from pmsmtool.commissioning.compared_stage import refuse_inertia
@@ -39,11 +39,11 @@ SPEED, UP, DOWN, JERK = PROFILE
 HELD, DESIGNED = "that the drive holds", "of the design"
 TRAVEL_MARGIN, SPEED_MARGIN = 1.5, 1.5
 """Limits over what is asked for: more ends the move. Calm gains of makers' tools go 30 % beyond a way of 60 degrees."""
-ERROR_SHARE = 0.5
-"""Following error at which the voltage is removed, of the way."""
 SLOW_CURRENT = 0.7
 """Bandwidth of the drive's own current loop, of the one that a design counts on, below which that is said: at 0.15 the
 following error was 31 degrees where 9 to 24 were predicted."""
+SLOWEST_SHARE = 0.4
+"""Least share of the limits asked for that a move is slowed to: a tenth of 40 rpm is too few counts to be found."""
 DURATION_S = 45.0
 """Longest time of a move there and back."""
 TRACE = "traces/move.npz"
@@ -137,6 +137,32 @@ def foretold_move(
     return ForetoldMove(min(errors), max(errors) + apart, whose, max(torques), torque, share)
 
 
+def followable(
+    design: Design, drive_map: DriveMap, held: Mapping[str, float], way_rad: float, limits: Profile, i_max_apk: float
+) -> tuple[Profile, str]:
+    """Return limits of a move with which neither the held nor the designed gains stay so far behind that it is ended.
+
+    Beside them what is said of that, empty where they are as they were. Gains that no slower move helps, such as
+    unstable ones, do not count. Parameters as of :func:`foretold_move`.
+    """
+    fastest, slower = limits, None
+    for gains in (held, {name: held[name] for name in CURRENT if name in held}):
+
+        def most(profile: Profile, gains: Mapping[str, float] = gains) -> float:
+            return foretold_move(design, drive_map, gains, way_rad, profile, i_max_apk).error_most_rad
+
+        slower = followed(way_rad, limits, most, SLOWEST_SHARE)
+        limits = slower or limits
+    if slower is None:
+        return limits, "with the gains of the design no slower move helps: give a longer way (--by)"
+    if limits == fastest:
+        return limits, ""
+    return limits, (
+        f"slower, with {limits.speed / fastest.speed:.2g} of speed and acceleration: the shaft would stay too far "
+        "behind, with the gains that the drive holds or with those of the design"
+    )
+
+
 def asked_profile(limits: Profile | None, speed_rad_s: float | None, acceleration: float | None) -> dict[str, float]:
     """Return the limits of the move by catalogue name: those of a design, or those that are asked for."""
     given = (speed_rad_s, acceleration, None) if limits is None else (limits.speed, limits.acceleration, limits.jerk)
@@ -174,13 +200,17 @@ class PlannedMove:
     """What the drive holds, and what is changed in it for the moves, by catalogue name."""
     find: tuple[float, float] | None
     """Speed and acceleration (rad/s, rad/s2) for which counts are found by the demand."""
+    limits: Profile | None
+    """Of a design, or slower; None without one."""
     foretold: ForetoldMove | None
     """What a design says of them."""
+    slowed: str = ""
+    """Why they are slower than asked for, or than the design's limits, or cannot be slow enough."""
 
     @property
     def error_limit_rad(self) -> float:
         """Following error at which the voltage is removed (rad)."""
-        return ERROR_SHARE * abs(self.way_rad)
+        return ENDED * abs(self.way_rad)
 
     def lines(self, drive: PositionDrive) -> list[str]:
         """Return what a person agrees to."""
@@ -191,6 +221,7 @@ class PlannedMove:
             f"the shaft moves by {math.degrees(self.way_rad):.4g} deg and back with the drive's own position "
             f"loop, {counted(self.times, 'time')}",
             f"voltage off where the shaft is {math.degrees(self.error_limit_rad):.3g} deg behind and comes no nearer",
+            *([self.slowed] if self.slowed else []),
             *(self.foretold.lines(self.error_limit_rad) if self.foretold else []),
             "before that it turns by a degree with little current, to see that it does not run away",
             *([] if self.find is None else ["its profile is found first by slower moves within this way"]),
@@ -201,7 +232,7 @@ class PlannedMove:
 
 def plan_move(
     drive: PositionDrive, allowed: Envelope, way_rad: float, times: int, design: Design | None,
-    speed_rad_s: float | None, acceleration: float | None,
+    speed_rad_s: float | None, acceleration: float | None, like: PlannedMove | None = None,
 ) -> PlannedMove:  # fmt: skip
     """Return the limits of moves on a drive, what is changed for them, and what a design says of them.
 
@@ -213,14 +244,22 @@ def plan_move(
     allowed : Envelope
         What a person allows; infinite: the current that the drive allows, and a speed above that of the move.
     design : Design or None
-        Its limits are those of the move, but for the speed (rad/s) and acceleration (rad/s2) that are given.
+        Its limits are those of the move, but for the speed (rad/s) and acceleration (rad/s2) that are given; all of
+        them are made slower where the gains that the drive holds, or the designed ones, would stay too far behind.
+    like : PlannedMove or None
+        A move whose limits this one has.
     """
     node, i_max, speed_max = drive.node, allowed.i_max_apk, allowed.speed_max_rad_s
     if math.isinf(i_max):
         i_max = drive.current_allowed_apk
     given = min([i_max, *(apk for _, apk in held_current_limits(node, drive.rated_apk))])
     refuse_no_current(node, given)
-    limits = None if design is None else limits_of_move(design, given, speed_rad_s, acceleration)
+    limits, slowed, gains = None, "", drive.held_gains()
+    if like is not None:
+        limits = like.limits
+    elif design is not None:
+        fastest = limits_of_move(design, given, speed_rad_s, acceleration)
+        limits, slowed = followable(design, node.map, gains, way_rad, fastest, given)
     profile = asked_profile(limits, speed_rad_s, acceleration)
     lent, find = lent_profile(drive, profile)
     if math.isinf(speed_max):
@@ -235,10 +274,10 @@ def plan_move(
         acceleration_rad_s2=None if design is None else largest_acceleration(design.machine.machine, i_max),
     )  # fmt: skip
     envelope.refuse_gravity()
-    gains, foretold = drive.held_gains(), None
+    foretold = None
     if design is not None and limits is not None:
         foretold = foretold_move(design, node.map, gains, way_rad, limits, given)
-    return PlannedMove(way_rad, times, envelope, gains, lent, find, foretold)
+    return PlannedMove(way_rad, times, envelope, gains, lent, find, limits, foretold, slowed)
 
 
 def make_move(

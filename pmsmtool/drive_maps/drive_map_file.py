@@ -50,7 +50,7 @@ _GAINS = {"torque constant": POLE_PAIRS, "current": "reference.K_t_nm_per_a"}
 """Other value of a form that needs always the same one."""
 _HEAD = ("schema", "name", "vendor", "product", "more_products", "staging")
 _TABLES = (IDENTITY, "capabilities", "objects", "signals", MOTION, RECORDER, "tables", "left_out", "sources", TABLE)
-_CELL_KEYS = ("index", "sub", "type", "factor", "offset", "unit", "rounding", "form", "gain", "source")
+_CELL_KEYS = ("index", "sub", "type", "factor", "offset", "unit", "rounding", "form", "gain", "low", "high", "source")
 _TEXT_KEYS = ("type", "unit", "form", "rounding", "gain", "source")
 _SIGNAL_KEYS = ("index", "sub", "type", "unit", "source")
 _FORM_UNIT: dict[str, str] = {"time": "s", "rate": "1/s", "relative": "1", "torque constant": "N m/A"}
@@ -114,6 +114,7 @@ def _cell_row(cell: Cell) -> dict[str, Any]:
     row |= {"rounding": cell.rounding} if cell.rounding != "nearest" else {}
     row |= {"form": cell.form} if cell.form != "value" else {}
     row |= {"gain": cell.gain} if cell.gain else {}
+    row |= {key: limit for key, limit in (("low", cell.low), ("high", cell.high)) if math.isfinite(limit)}
     return row | ({"source": cell.source} if cell.source else {})
 
 
@@ -276,6 +277,9 @@ def _parse_cell(
     offset = row.get("offset", 0.0)
     if not _is_number(offset):
         tell("offset", "offset must be a finite number")
+    limits = {key: row[key] for key in ("low", "high") if key in row}
+    for key in (key for key, limit in limits.items() if not _is_number(limit)):
+        tell(key, f"{key} must be a finite number of counts")
     if said:
         return None
     if row["type"].startswith("UNSIGNED") and parameter.minimum < 0.0 <= min(offset, offset + factor):
@@ -283,7 +287,7 @@ def _parse_cell(
         return None
     return Cell(
         name, row["index"], row["sub"], row["type"], factor, float(offset), row.get("rounding", "nearest"), gain,
-        row["unit"], form, row.get("source", ""),
+        row["unit"], form, row.get("source", ""), **limits,
     )  # fmt: skip
 
 

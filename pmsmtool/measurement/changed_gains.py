@@ -19,7 +19,7 @@ from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import GuardedDrive, guarded
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive.torque_drives import TorqueDrive
-from pmsmtool.drive_maps.drive_map import LETTERS, DriveMap
+from pmsmtool.drive_maps.drive_map import LETTERS, Cell, DriveMap
 from pmsmtool.errors import IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal, SdoAbort
 from pmsmtool.flash.gain_journal import GainJournal
 from pmsmtool.flash.journal import Entry
@@ -28,6 +28,8 @@ GAIN, INTEGRAL = "speed.K_p_nms_per_rad", "speed.K_i_nm_per_rad"
 STANDARD = {GAIN: (0x60F9, 1), INTEGRAL: (0x60F9, 2)}
 """Where CiA 402 puts the gains of the speed loop; what one count is worth it leaves to the maker."""
 ADDRESS = re.compile(r"0x([0-9A-F]{4}):([0-9A-F]{2})")
+RANGE = re.compile(r"\((\d+)\.\.(\d+)\)")
+"""Smallest and largest count of them, where such a reason has it: "0x2331:01 (1..255) has no unit ..."."""
 HOLDS = re.compile(r" (?:has|holds) ")
 """Reasons why a map leaves a gain out begin with its objects: "0x2331:01 or 0x60F9:01 has no unit ..."."""
 BACK = "the next `pmsmtool` command that opens this drive restores them, and so does a reset"
@@ -46,6 +48,8 @@ class GainObject:
     name: str
     item: DriveObject
     counts: float
+    limits: tuple[float, float] = (-math.inf, math.inf)
+    """Smallest and largest count that it takes, as far as its map says so."""
 
     @property
     def address(self) -> str:
@@ -78,8 +82,18 @@ def gain_address(node: DriveNode, name: str) -> tuple[int, int]:
 
 def named_addresses(drive_map: DriveMap, name: str) -> list[tuple[int, int]]:
     """Return the objects that the map of a drive names for a gain whose unit nobody publishes."""
-    places = ADDRESS.findall(HOLDS.split(drive_map.left_out.get(name, ""))[0])
-    return [(int(index, 16), int(sub, 16)) for index, sub in places]
+    return [(int(index, 16), int(sub, 16)) for index, sub in ADDRESS.findall(_told(drive_map, name))]
+
+
+def _told(drive_map: DriveMap, name: str) -> str:
+    return HOLDS.split(drive_map.left_out.get(name, ""))[0]
+
+
+def _limits(node: DriveNode, name: str, cell: Cell | None) -> tuple[float, float]:
+    if cell is not None:
+        return cell.low, cell.high
+    told = RANGE.search(_told(node.map, name))
+    return (float(told[1]), float(told[2])) if told else (-math.inf, math.inf)
 
 
 def gain_object(node: DriveNode, name: str, index: int, sub: int, *, may_be_zero: bool = False) -> GainObject:
@@ -110,7 +124,7 @@ def gain_object(node: DriveNode, name: str, index: int, sub: int, *, may_be_zero
             f"{name}: its bytes {data.hex()} may be a whole number or a REAL32", where=where,
             hint="give the object with its type in a map: --map FILE",
         )  # fmt: skip
-    found = GainObject(name, item, held)
+    found = GainObject(name, item, held, _limits(node, name, cell))
     if not may_be_zero:
         changed_counts(found, DOWN)
     return found

@@ -79,9 +79,11 @@ HOLD_S, HOLD_TIMES, HOLD_INTEGRAL = (0.04, 0.3), 5.0, 1.5
 """How long a step is held: these many times the time constants of loop and integral; less in every other way."""
 SETTLE_S, REST_AT_LOW_S, LEAST_S = 0.8, 0.4, 2.4
 SETTLE_TIMES, LONGEST_S = 8.0, 4.0
-"""Time constants of the integral for which the first speed is held, and at most how long; half of them at half gain."""
+"""Time constants of the integral for which the first speed is held, and at most how long; half of them at half gain.
+With six of them K_p of a Nanotec PD4-C (1226) seemed to move by 20 % with the integral part."""
 LONGER = 2
-"""Times as long the records last that scales rest on: in shorter ones ripple moved K_i by 3 to 10 %."""
+"""Times as long the records last that scales rest on, where the current that is asked for is not shown, and where
+shorter ones did not decide: in these ripple moved K_i by 3 to 10 %."""
 PULSES, PULSE_JUMP, PULSE_LEAST = 4, 0.4, 0.25
 """How many torque pulses; their jump of the reference, of the speeds between which it climbs (a loop whose integral
 winds up goes as far beyond it); their least current, of that of the steps."""
@@ -112,6 +114,9 @@ class LearnedLoop:
     notes: Sequence[str]
     by_asked: bool = False
     """Whether everything rests on the current that the loop asks for; else on the one that flows."""
+
+
+Decided = Callable[[LearnedLoop], bool]
 
 
 def high_share(node: DriveNode) -> float:
@@ -183,8 +188,11 @@ def learn_speed_loop(
     envelope: Envelope,
     emf: Emf,
     say: Callable[[str], None],
+    decided: Decided = lambda measured: True,
 ) -> LearnedLoop:
     """Measure the speed loop with the drive's own gains and with each changed; the drive is as before on return.
+
+    What is not ``decided`` by short records is measured once more, by longer ones.
 
     Raises SafetyRefusal, LimitExceeded: refused, or the loop began to oscillate: the voltage is off and the gains are
     back; NotAvailable: the drive does not follow its velocity mode, or a gain cannot be changed.
@@ -197,7 +205,7 @@ def learn_speed_loop(
             last.callback(drive.end_samples)
             drive.fastest_rad_s = envelope.speed_max_rad_s * trip_share(drive.node)
             last.callback(guard.quick_stop)
-            return _Learner(guard, drive, put, emf, say).run(gain, integral)
+            return _Learner(guard, drive, put, emf, say).run(gain, integral, decided)
 
 
 def _margin(own: Observation, worst: tuple[float, float]) -> float:
@@ -246,7 +254,7 @@ def staircase(
     tick = step * bandwidth * TICK_S
     speeds = [low] * round(REST_AT_LOW_S / TICK_S)
     ways: list[tuple[float, float]] = []
-    while len(speeds) * TICK_S < least_s:
+    while len(speeds) * TICK_S < least_s or not ways:
         ticks = max(1, round(HOLD_SHARES[len(ways) % 2] * hold_s / TICK_S))
         begin = len(speeds) - 1
         speeds += [low + step * (k // ticks + 1) + CLIMB * tick * (k + 1) for k in range(number * ticks)]
@@ -269,37 +277,53 @@ class _Learner:
         say: Callable[[str], None],
     ) -> None:
         self.guard, self.drive, self.put, self.emf, self.say = guard, drive, put, emf, say
-        self.least_s = LEAST_S
         limit = guard.envelope.speed_max_rad_s
         self.low, self.span = LOW_SHARE * limit, (high_share(drive.node) - LOW_SHARE) * limit
         self.bandwidth, self.hold_s, self.settle_s = FIRST_BANDWIDTH, HOLD_TIMES / FIRST_BANDWIDTH, SETTLE_S
         self.notes: list[str] = []
         self.shares: list[float] = []
         self.apart = 0.0
-        self.asks = False
+        self.asks = self.long = False
         self.step_current_a = 0.0, math.inf
+        self.unit = math.nan
+        self.first: SpeedLoop | None = None
 
-    def run(self, gain: GainObject, integral: GainObject) -> LearnedLoop:
-        """Measure everything."""
+    def run(self, gain: GainObject, integral: GainObject, decided: Decided) -> LearnedLoop:
+        """Measure everything; with longer records once more where everything was changed and that did not decide."""
+        step, counts = self.prepare(gain, integral)
+        measured = self.observe(gain, integral, step, counts)
+        if not self.long and measured.gain_changed and measured.integral_changed and not decided(measured):
+            self.long = True
+            measured = self.observe(gain, integral, step, counts)
+        return measured
+
+    def prepare(self, gain: GainObject, integral: GainObject) -> tuple[float, dict[str, float]]:
+        """Return the step (rad/s) that suits the loop, and the counts of its gains, by name."""
         guard, drive = self.guard, self.drive
         guard.enable()
-        unit = find_speed_unit(guard, drive, 0.5 * guard.envelope.speed_max_rad_s)
+        self.unit = find_speed_unit(guard, drive, 0.5 * guard.envelope.speed_max_rad_s)
         self.say(
-            f"one count of 0x60FF is {unit:.5g} rad/s; the steps are taken between {self.low:.4g} and "
+            f"one count of 0x60FF is {self.unit:.5g} rad/s; the steps are taken between {self.low:.4g} and "
             f"{self.low + self.span:.4g} rad/s"
         )
         counts = {GAIN: gain.counts, INTEGRAL: integral.counts}
-        own = self._observe("with the drive's own gains", self._size(), counts)
+        step = self._size(FIRST_STEP * self.span)
+        own = self._observe("with the drive's own gains", step, counts)
         self.bandwidth = own.loops[-1].K_p_per_J
         integral_s = self.bandwidth / own.loops[-1].K_i_per_J
         self.settle_s = min(max(SETTLE_S, SETTLE_TIMES * integral_s), LONGEST_S)
         wanted_s = max(HOLD_TIMES / self.bandwidth, HOLD_INTEGRAL * integral_s)
         self.hold_s = min(max(wanted_s, HOLD_S[0]), HOLD_S[1])
-        step = self._size()
+        self.first, step = own.loop, self._size(step)
+        self.long = not self.asks
         if not self.asks:
             self._show_current_loop(step)
-        self.least_s *= LONGER
-        own = self._observe(f"with steps held for {1e3 * self.hold_s:.0f} ms", step, counts, own.loop)
+        return step, counts
+
+    def observe(self, gain: GainObject, integral: GainObject, step: float, counts: Mapping[str, float]) -> LearnedLoop:
+        """Measure the loop with its own gains, with half of the step, and with each gain changed."""
+        drive = self.drive
+        own = self._observe(f"with steps held for {1e3 * self.hold_s:.0f} ms", step, counts, self.first)
         drive.oscillation.limit_a = TRIP * max(drive.oscillation.largest_a, drive.current_count_a)
         half = self._observe("with steps of half the size", 0.5 * step, counts, own.loop, own.loop.lag_s)
         down = DOWN if _margin(own, (DOWN, DOWN)) >= LEAST_MARGIN_DOWN_RAD else GAIN_LITTLE_DOWN
@@ -311,7 +335,7 @@ class _Learner:
         if further is not None:
             integral_changed.append(self._changed(integral, further, own, (1.0, FURTHER_DOWN), step, counts))
         found = [observation for observation in integral_changed if observation is not None]
-        measured = LearnedLoop((own, half), gain_changed, found, unit, self.notes)
+        measured = LearnedLoop((own, half), gain_changed, found, self.unit, self.notes)
         if all(one is None or one.asked for one in (own, half, gain_changed, *found)):
             return _by_asked(measured)
         self.notes.append(
@@ -325,14 +349,17 @@ class _Learner:
         """By how many steps the reference rises in the longest hold, with the step itself."""
         return 1.0 + CLIMB * self.bandwidth * self.hold_s
 
-    def _size(self) -> float:
-        """Return the step of speed whose current is large against friction and small against every limit."""
+    def _size(self, step: float) -> float:
+        """Return the step of speed whose current is large against friction and small against every limit.
+
+        ``step``: the first one that is tried (rad/s).
+        """
         drive, guard = self.drive, self.guard
         wanted = STEP_CURRENT * min(guard.envelope.i_max_apk, drive.current_limit_apk, drive.rated_apk)
         most = self.span / (STEPS[0] * self.risen)
-        step = min(FIRST_STEP * self.span, most)
+        step = min(step, most)
         for _ in range(TRIES):
-            record = self._record(step, most_steps=STEPS[0])
+            record = self._record(step, most_steps=STEPS[0], least_s=0.0)
             held = float(np.median(record.current_a[record.t_s < record.references[1][0]]))
             self.step_current_a = abs(held), float(np.abs(record.current_a).max())
             shown = np.abs(record.current_a - held)
@@ -391,10 +418,11 @@ class _Learner:
         excitation = Excitation(Shape.BUFFER, Injection.SPEED, 0.0, hold_periods=hold, buffer=speeds)
         return self.guard.record(("theta_m_rad", "i_q_a"), hold * len(speeds), excitation=excitation)
 
-    def _record(self, step: float, most_steps: int = STEPS[1]) -> StepRecord:
+    def _record(self, step: float, most_steps: int = STEPS[1], least_s: float | None = None) -> StepRecord:
         drive = self.drive
+        least_s = (LONGER * LEAST_S if self.long else LEAST_S) if least_s is None else least_s
         number = min(most_steps, max(STEPS[0], int(self.span / (step * self.risen))))
-        speeds, ways = staircase(self.low, step, number, self.bandwidth, self.hold_s, self.least_s)
+        speeds, ways = staircase(self.low, step, number, self.bandwidth, self.hold_s, least_s)
         trace = self._taken(speeds)
         t, position, current = trace.t_s, trace["theta_m_rad"], trace["i_q_a"]
         references = [(float(at), float(value)) for at, value in trace.meta["steps"]]

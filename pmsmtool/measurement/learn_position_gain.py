@@ -2,7 +2,8 @@
 """``map learn``, its second part: moves at even speed with the drive's own position gain, and with 0.7 of it.
 
 The only change of the gain is a step down. The feed-forwards of speed and acceleration are 0 meanwhile, where they have
-objects; they are learned last, with the drive's own counts, or with as many as are seen, from one upwards.
+objects; they are learned last, with the drive's own counts, or with as many as are seen, from one upwards. A derivative
+part beside the gain is as small as its object lets it be; it is learned from the drive's own counts alone.
 """
 
 from __future__ import annotations
@@ -46,9 +47,14 @@ from pmsmtool.trace import Trace
 
 POSITION = "position.K_p_per_s"
 FORWARDS = FORWARD, LEAD = "position.velocity_ff", "position.acceleration_ff_s"
-SPEED_RAD_S, RAMP_S, EVEN_S = 2.0 * math.pi, 0.25, 3.0
-"""A turn per second: cogging is even over a turn; three of them, so that gains down to 3 1/s settle."""
+DERIVATIVE = "position.derivative_share"
+"""It raises the gain of the speed loop: no more of it than the drive holds is tried."""
+BESIDE = (*FORWARDS, DERIVATIVE)
+SPEED_RAD_S, RAMP_S, EVEN_S = 2.0 * math.pi, 0.25, 2.0
+"""A turn per second: cogging is even over a turn, and the second of two shows the lag, with gains down to 4 1/s."""
 WAY_RAD = SPEED_RAD_S * (EVEN_S + RAMP_S)
+LONGER, SHORT = 2.0, 0.5
+"""Way over that: for a lag that has not settled, and to see a feed-forward."""
 SHORT_RAD = 0.5 * math.pi
 """Way of the moves that find the drive's own profile."""
 REST_S = 1.0
@@ -59,9 +65,9 @@ FASTEST, UNWATCHED_S = 2.0, 2.0 * WATCH_S
 where only the guard's looks watch it. With 0.3 of the current of the steps friction ended those of light rotors."""
 BEHIND = 0.5
 """Largest lag of a shaft that does not follow, of the way."""
-SEEN, AIM, GROWTH, FORWARD_MOVES = 0.3, 0.8, 8.0, 10
-"""Share of the speed from which a feed-forward is clearly seen, the one aimed at until then, by how much its counts
-grow at most, and in how many moves: 8^10 is more than four bytes hold."""
+SEEN, AIM, SURELY, GROWTH, FORWARD_MOVES = 0.3, 0.8, 2.0, 64.0, 10
+"""Share of the speed from which a feed-forward is clearly seen, and the one aimed at until then, by as many standard
+deviations above what was seen; by how much its counts grow at most, and in how many moves."""
 LEAD_SEEN_S, LEAD_AIM_S = 12e-3, 30e-3
 """The same of a feed-forward of the acceleration: the aim is 0.75 rad/s on the ramps of these moves."""
 
@@ -73,19 +79,19 @@ def position_gain(node: DriveNode, address: tuple[int, int] | None = None) -> Ga
 
 
 def position_gain_objects(node: DriveNode, asked: Mapping[str, tuple[int, int] | None]) -> dict[str, GainObject]:
-    """Return the position gain where it is asked for, and the feed-forwards beside it; else none."""
+    """Return the position gain where it is asked for, and the objects beside it; else none."""
     gain = position_gain(node, asked[POSITION]) if POSITION in asked else None
-    return {} if gain is None else {POSITION: gain, **forward_objects(node)}
+    return {} if gain is None else {POSITION: gain, **objects_beside(node)}
 
 
 def _place(node: DriveNode, name: str) -> tuple[int, int] | None:
     return next((address for address in named_addresses(node.map, name) if node.has(*address)), None)
 
 
-def forward_objects(node: DriveNode) -> dict[str, GainObject]:
-    """Return the objects of both feed-forwards, whatever they hold, as far as they are whole numbers."""
+def objects_beside(node: DriveNode) -> dict[str, GainObject]:
+    """Return the objects of feed-forwards and derivative, whatever they hold, as far as they are whole numbers."""
     found = {}
-    for name in FORWARDS:
+    for name in BESIDE:
         where = node.map.address(name) if name in node.map.cells else _place(node, name)
         with contextlib.suppress(NotAvailable):
             if where is not None:
@@ -113,7 +119,7 @@ def learn_position_gain(
             drive.close()
     except (IdentificationError, NotAvailable, SafetyRefusal) as error:
         likely = f" (likely: {error.likely})" if error.likely else ""
-        name = next((name for name in (POSITION, *forward_objects(node)) if name not in found), POSITION)
+        name = next((name for name in (POSITION, *objects_beside(node)) if name not in found), POSITION)
         found[name] = Learned(name, None, math.inf, None, "", error.what.partition("\n")[0] + likely)
         return found, error if isinstance(error, LimitExceeded) else None
     return found, None
@@ -125,56 +131,89 @@ def _moved(
     """Move with the gain as it is and with less of it, then with the speed fed forward; note what is found."""
     node = drive.node
     refuse_unsafe(node, envelope)
-    forwards = forward_objects(node)
-    written = [gain, *forwards.values()]
+    beside = objects_beside(node)
+    written = [gain, *beside.values()]
     drive.error_limit_rad = BEHIND * WAY_RAD
     lags: list[tuple[float, PositionLag]] = []
     areas: list[Array] = []
-    envelope = replace(envelope, travel_rad=TRAVEL * WAY_RAD)
+    envelope = replace(envelope, travel_rad=TRAVEL * LONGER * WAY_RAD)
     if not limits_speed(node):
         limit = envelope.speed_max_rad_s
         speed = min(FASTEST * SPEED_RAD_S, limit)
         share = within_budget(node, envelope.acceleration_rad_s2, MOST * limit - speed, UNWATCHED_S)
         envelope = replace(envelope, speed_max_rad_s=speed, i_max_apk=share * envelope.i_max_apk)
+    way = WAY_RAD
     with changing(drive, written, envelope, say) as (guard, put):
-        for forward in forwards.values():
-            if forward.counts:
-                put(forward, 0.0)
+
+        def lagging() -> tuple[Trace, PositionLag]:
+            """Move, once more and further where the lag has not settled."""
+            nonlocal way
+            trace, _ = record_move(guard, drive, way, REST_S)
+            try:
+                return trace, position_lag(trace, drive.rad_per_count)
+            except IdentificationError:
+                if way > WAY_RAD:
+                    raise
+                way *= LONGER
+                return lagging()
+
+        for item in beside.values():
+            if item.counts != _least(item):
+                put(item, _least(item))
         record_move(guard, drive, SHORT_RAD, REST_S, find=(SPEED_RAD_S, SPEED_RAD_S / RAMP_S))
         for counts in (gain.counts, changed_counts(gain, DOWN)):
             if lags:
                 put(gain, counts)
-            trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
-            lags.append((counts, position_lag(trace, drive.rad_per_count)))
-            if LEAD in forwards:
+            trace, lag = lagging()
+            lags.append((counts, lag))
+            if beside.keys() & {LEAD, DERIVATIVE}:
                 areas.append(ramp_areas(trace))
-            say(f"{gain.address} = {counts:.9g}: speed over lag {lags[-1][1].gain_per_s:.4g} 1/s")
+            say(f"{gain.address} = {counts:.9g}: speed over lag {lag.gain_per_s:.4g} 1/s")
         put(gain, gain.counts)
-        told = position_scale(lags[0], lags[1], POSITION, forward_is_zero=FORWARD in forwards)
+        told = position_scale(lags[0], lags[1], POSITION, forward_is_zero=FORWARD in beside)
         found[POSITION] = told
 
-        def learn(name: str, seen: float, aim: float, unit: str, fed: Callable[[Trace], tuple[float, float]]) -> None:
-            """Feed forward until it is seen; note what one count of it is worth."""
-            forward = forwards[name]
+        def fed_by(item: GainObject, counts: float, unit: str, fed: Fed, part: float = 1.0) -> tuple[float, float]:
+            """Return what some counts feed forward, and its standard deviation, from moves by part of the way."""
+            put(item, counts)
+            share, std = fed(record_move(guard, drive, part * way, REST_S)[0])
+            say(f"{item.address} = {counts:.9g}: {share:.3g} {unit} fed forward")
+            return share, std
+
+        def learn(name: str, seen: float, aim: float, unit: str, fed: Fed) -> None:
+            """Feed forward until it is seen, with short moves; note what one count of it is worth."""
+            forward = beside[name]
             counts = forward.counts or 1.0
             for _ in range(FORWARD_MOVES):
-                put(forward, counts)
-                trace, _ = record_move(guard, drive, WAY_RAD, REST_S)
-                share, std = fed(trace)
-                say(f"{forward.address} = {counts:.9g}: {share:.3g} {unit} fed forward")
-                more = round(counts * min(GROWTH, aim / max(share, aim / GROWTH)))
+                share, std = fed_by(forward, counts, unit, fed, SHORT)
+                more = round(counts * aim / max(share + SURELY * std, aim / GROWTH))
                 if share > seen or more > _most(forward):
                     break
                 counts = more
             found[name] = forward_scale(counts, share, std, name, unit)
+            if found[name].scale is None:
+                found[name] = forward_scale(counts, *fed_by(forward, counts, unit, fed), name, unit)
             put(forward, 0.0)
 
-        if FORWARD in forwards and told.scale is not None:
+        if FORWARD in beside and told.scale is not None:
             learn(FORWARD, SEEN, AIM, "1", lambda trace: fed_share(trace, lags[0][1]))
-        if LEAD in forwards and told.scale is not None:
+        if LEAD in beside and told.scale is not None:
             learn(LEAD, LEAD_SEEN_S, LEAD_AIM_S, "s", lambda trace: led_s(trace, areas[0]))
+        held = beside.get(DERIVATIVE)
+        if held is not None and told.scale is not None and held.counts > _least(held):
+            # over a ramp T e' takes from the lag what T a fed forward takes; T is the share over the position gain
+            led, std = (lags[0][1].gain_per_s * x for x in fed_by(held, held.counts, "s", lambda t: led_s(t, areas[0])))
+            found[DERIVATIVE] = forward_scale(held.counts - _least(held), led, std, DERIVATIVE)
         for item in written:
             put(item, item.counts)
+
+
+Fed = Callable[[Trace], tuple[float, float]]
+
+
+def _least(item: GainObject) -> float:
+    """Return the smallest counts that an object takes."""
+    return max(item.limits[0], 0.0)
 
 
 def _most(gain: GainObject) -> float:

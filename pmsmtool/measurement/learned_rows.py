@@ -56,6 +56,9 @@ class MeasuredRow:
     """One count."""
     half_width: float
     """Of the scale, relative, 95 %."""
+    low: float = -math.inf
+    high: float = math.inf
+    """Smallest and largest count, where the map of the drive's family says so."""
 
     def cell(self) -> Cell:
         """Return the row of a map."""
@@ -63,7 +66,7 @@ class MeasuredRow:
         unit = f"{self.scale:.6g} {self.unit}"
         return Cell(
             self.name, self.index, self.sub, self.wire, wire_unit(unit).scale, gain=self.gain, unit=unit,
-            form=self.form, source=SOURCE,  # type: ignore[arg-type]
+            form=self.form, source=SOURCE, low=self.low, high=self.high,  # type: ignore[arg-type]
         )  # fmt: skip
 
     def against(self, published: Cell) -> str:
@@ -192,7 +195,7 @@ def measured_row(gain: GainObject, found: Learned) -> MeasuredRow:
     signed = letter.lower() if gain.counts < 1 << 8 * gain.item.size - 1 else letter
     return MeasuredRow(
         gain.name, gain.item.index, gain.item.sub, _WIRES[signed], found.form, other, found.scale,
-        found.unit, found.half_width,
+        found.unit, found.half_width, *gain.limits,
     )  # fmt: skip
 
 

@@ -280,6 +280,8 @@ CLOSED_DRIVE: tuple[Parameter, ...] = (
         "torque per derivative of it"),
     Parameter("position.acceleration_ff_s", 0x2022, 8, _F32, "s", 0, 0, 10, True,
         "speed per move acceleration, added to the reference of the speed"),
+    Parameter("position.derivative_share", 0x2022, 9, _F32, "1", 0, 0, 10, True,
+        "share of the speed of the position error, added to the reference of the speed"),
 )
 """What other makers' drives have besides: limits of CiA 402, speed and position loops. Not in the reference drive's image."""
 # fmt: on

@@ -17,6 +17,7 @@ from pmsmtool.axis import search
 from pmsmtool.axis.design import move_peaks, own_move, profile_of, profile_within, with_axis
 from pmsmtool.axis.drive import (
     CASCADE,
+    DERIVATIVE,
     LEAD,
     LOOSEST,
     PID,
@@ -224,6 +225,25 @@ def test_an_acceleration_may_be_fed_forward_to_the_speed_alone() -> None:
     held = {name: led[name] for name in (CASCADE[1], LEAD)}
     error = move_peaks(path, lifted(path), gains, move, held, 0.0)[0]
     assert error == pytest.approx(float(led.facts["axis_following_error_rad"]), rel=1e-3)
+
+
+@pytest.mark.chain
+def test_without_a_feed_forward_the_move_is_slow_and_a_derivative_part_as_small_as_it_can_be() -> None:
+    """A Faulhaber has none: at the speed that the voltage allows it stays so far behind that a move is ended."""
+    rows = [
+        MeasuredRow(SPEED[0], 0x2331, 1, "UNSIGNED16", "value", "", 0.02, "N m s/rad", 0.1, 1, 255),
+        MeasuredRow(SPEED[1], 0x2331, 2, "UNSIGNED16", "value", "", 0.3, "N m/rad", 0.1, 1, 255),
+        MeasuredRow(CASCADE[0], 0x2332, 1, "UNSIGNED16", "value", "", 0.2, "1/s", 0.1, 1, 255),
+        MeasuredRow(DERIVATIVE, 0x2332, 2, "UNSIGNED16", "value", "", 0.02, "1", 0.1, 1, 255),
+    ]
+    drive_map = with_measured(load_family("faulhaber"), 0x147, 0xC4E, rows, "", None)
+    assert (drive_map.cells[SPEED[0]].low, drive_map.cells[SPEED[0]].largest) == (1.0, 255.0)
+    made = design_axis(machine(0.0, 0.0), TuneRequest(), replace(ASKED, loop_rate_hz=200.0), drive_map)
+    assert made[DERIVATIVE] == 0.02 and DERIVATIVE in axis_parameters(made).values, "one count, its least"
+    assert made[SPEED[0]] <= 255 * 0.02 and made[CASCADE[0]] <= 255 * 0.2
+    assert any("of the speed and acceleration that voltage and torque allow" in note for note in made.notes)
+    behind = float(made.facts["axis_following_error_rad"]) + float(made.facts["axis_friction_error_rad"])
+    assert 0.3 * math.pi < behind <= 0.45 * math.pi, "at 138 degrees without"
 
 
 @pytest.mark.chain

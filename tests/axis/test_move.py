@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import math
+from functools import partial
+
 import numpy as np
 import pytest
 
-from pmsmtool.axis.move import Profile, compared_moves, move_result, plan, same_move, shown
+from pmsmtool.axis.move import Profile, compared_moves, followed, move_result, plan, same_move, shown
 from pmsmtool.errors import IdentificationError
 from pmsmtool.identification.move_mechanics import halves_of_moves
 from pmsmtool.trace import Trace
@@ -69,6 +72,24 @@ def test_the_same_move_has_the_same_way_and_speed() -> None:
     assert same_move(record(40e-3), record(2e-3))
     assert not same_move(record(2e-3), record(2e-3, way=1.03 * WAY))
     assert not same_move(record(2e-3), record(2e-3, speed=6.0))
+
+
+def test_a_move_is_as_slow_as_keeps_its_error_from_the_one_that_ends_it() -> None:
+    """Two Nanotec PD4-C stayed 30.1 and 30.4 degrees behind with the designed gains, and 30 end a move of 60."""
+    fast = Profile(100.0, 400.0, 8000.0)
+    tried: list[Profile] = []
+
+    def behind(share: float, profile: Profile) -> float:
+        tried.append(profile)
+        return share * profile.speed / fast.speed
+
+    assert followed(-2.0, fast, partial(behind, 0.9)) is fast and tried == [fast]
+    slow = followed(-2.0, fast, partial(behind, 3.0))
+    assert slow is not None and 0.8 < 3.0 * slow.speed / fast.speed <= 0.9
+    assert slow.acceleration / slow.speed == pytest.approx(4.0)
+    assert slow.jerk / slow.acceleration == pytest.approx(20.0), "the load is at rest after the same ramp"
+    assert followed(2.0, fast, lambda profile: 0.95) is None, "friction: no slower move helps"
+    assert followed(2.0, fast, lambda profile: math.inf) is None
 
 
 def test_two_moves_number_by_number() -> None:

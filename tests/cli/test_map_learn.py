@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,13 +22,15 @@ from pmsmtool.drive.drive_node import DriveNode
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.guard import GuardedDrive, guarded
 from pmsmtool.drive.objects import DriveObject
+from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.drive.speed_loop_drive import Oscillation, SpeedLoopDrive
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import DriveFault, LimitExceeded, SafetyRefusal
 from pmsmtool.flash.gain_journal import any_left
 from pmsmtool.identification.asked_current import AskedLoop
-from pmsmtool.identification.learned_gains import Observation
+from pmsmtool.identification.learned_gains import Learned, Observation
+from pmsmtool.identification.position_lag import PositionLag
 from pmsmtool.identification.speed_loop_response import Emf, SpeedLoop
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file, machine_path
 from pmsmtool.measurement import changed_gains, learn_gains, learn_position_gain
@@ -37,6 +41,7 @@ from pmsmtool.sim.node.node import Node
 from pmsmtool.trace import Trace
 from pmsmtool.units import rad_s_from_rpm
 from tests.cli.conftest import Tool
+from tests.drive.table_drive import node_of
 from tests.foreign.data_sheets import COMMON, HEARTBEAT, Row, identity, write_eds
 
 SEED = 4
@@ -171,6 +176,48 @@ def test_a_learned_position_gain_is_the_drawn_one(tool: Tool, tmp_path: Path, mo
     bench.holder.close()
 
 
+@pytest.mark.parametrize(("held", "led_s"), [(21.0, 0.05), (1.0, None)])
+def test_a_derivative_part_is_as_small_as_it_can_be_and_is_learned_from_what_it_held(
+    held: float, led_s: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """0x2332:02 of a Faulhaber takes 1 to 255; the gain of its loop is larger by what it is worth."""
+    written: list[tuple[str, float]] = []
+    acting = {learn_position_gain.POSITION: 100.0}
+
+    def put(gain: changed_gains.GainObject, counts: float) -> None:
+        acting[gain.name] = counts
+        written.append((gain.name, counts))
+
+    @contextmanager
+    def changing(*arguments: Any) -> Iterator[tuple[MagicMock, Any]]:
+        yield MagicMock(), put
+
+    def lag(trace: object, rad_per_count: float) -> PositionLag:
+        gain = 0.1 * acting[learn_position_gain.POSITION]
+        return PositionLag(gain, 1e-3, 0.0, 1e-3, (1.0 / gain, 1.0 / gain))
+
+    monkeypatch.setattr(learn_position_gain, "changing", changing)
+    monkeypatch.setattr(learn_position_gain, "record_move", lambda *arguments, **found: (MagicMock(), None))
+    monkeypatch.setattr(learn_position_gain, "position_lag", lag)
+    monkeypatch.setattr(learn_position_gain, "ramp_areas", lambda trace: None)
+    monkeypatch.setattr(learn_position_gain, "led_s", lambda trace, areas: (led_s, 1e-3))
+    counts = {DriveObject(0x2332, 1, "H"): 100.0, DriveObject(0x2332, 2, "H"): held}
+    found: dict[str, Learned] = {}
+    with node_of(counts, load_family("faulhaber")) as (_, node):
+        gain = learn_position_gain.position_gain(node)
+        assert gain is not None
+        drive = cast(PositionDrive, MagicMock(node=node))
+        learn_position_gain._moved(drive, gain, Envelope(8.0, 60.0), lambda text: None, found)
+    name = learn_position_gain.DERIVATIVE
+    assert found[learn_position_gain.POSITION].scale == pytest.approx(0.1)
+    asked = [counts for which, counts in written if which == name]
+    if led_s is None:
+        assert name not in found and asked == [1.0], "it is not more than its least: as it was at the end"
+        return
+    assert found[name].scale == pytest.approx(10.0 * led_s / 20.0), "K_v times the lead, over 20 counts more"
+    assert asked == [1.0, held, held], "its least, its own counts, which are learned, and as it was"
+
+
 def test_measured_rows_make_a_map_and_check_a_published_one() -> None:
     rows = [
         MeasuredRow(GAIN, 0x60F9, 1, "UNSIGNED16", "value", "", 2e-4, "N m s/rad", 0.1),
@@ -293,18 +340,20 @@ def test_the_predicted_margin_counts_on_the_integral_part_that_the_loop_asks_for
     assert alone == pytest.approx(math.radians(35.0), abs=MARGIN_TOL_RAD)
 
 
-@pytest.mark.parametrize(("asks", "at_bound"), [(True, ""), (False, ""), (False, "lag")])
-def test_what_scales_rest_on_is_recorded_long_and_nothing_is_changed_on_a_fit_at_a_bound(
-    asks: bool, at_bound: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("asks", "at_bound", "decided"), [(True, "", True), (True, "", False), (False, "", False), (False, "lag", False)]
+)
+def test_records_are_long_where_short_ones_do_not_decide_and_nothing_is_changed_on_a_fit_at_a_bound(
+    asks: bool, at_bound: str, decided: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of 1112 (an EPOS4, which shows the asked current) ripple moved K_i by 9 % in 2.4 s."""
-    lasted: list[float] = []
+    """120 s under voltage for a Nanotec PD4-C, where half of them did."""
+    lasted: list[bool] = []
     pulses: list[float] = []
     put: list[object] = []
     loop = SpeedLoop(40.0, 200.0, 2e-3, 1e-3, 0.02, at_bound=at_bound)
 
     def observe(self: Any, what: str, step: float, counts: Any, *known: Any) -> Observation:
-        lasted.append(self.least_s)
+        lasted.append(self.long)
         self.asks = asks
         return Observation(
             counts[GAIN], counts[INTEGRAL], loop, asked=AskedLoop(loop, (0.0, 0.0, 0.0)) if asks else None
@@ -312,16 +361,18 @@ def test_what_scales_rest_on_is_recorded_long_and_nothing_is_changed_on_a_fit_at
 
     monkeypatch.setattr(learn_gains, "find_speed_unit", lambda *arguments: 1e-3)
     monkeypatch.setattr(learn_gains._Learner, "_observe", observe)
-    monkeypatch.setattr(learn_gains._Learner, "_size", lambda self: 1.0)
+    monkeypatch.setattr(learn_gains._Learner, "_size", lambda self, step: 1.0)
     monkeypatch.setattr(learn_gains._Learner, "_show_current_loop", lambda self, step: pulses.append(step))
     guard, drive = MagicMock(envelope=Envelope(6.0, 50.0)), MagicMock(current_count_a=0.01)
     drive.oscillation.largest_a = 1.0
     learner = learn_gains._Learner(guard, drive, lambda *arguments: put.append(arguments), Emf(0.0, 100.0), print)
     gain, integral = DriveObject(0x60F9, 1, "H"), DriveObject(0x60F9, 2, "H")
     measured = learner.run(
-        changed_gains.GainObject(GAIN, gain, 1000.0), changed_gains.GainObject(INTEGRAL, integral, 1000.0)
-    )
-    assert lasted[:3] == [learn_gains.LEAST_S, *(learn_gains.LONGER * learn_gains.LEAST_S,) * 2]
+        changed_gains.GainObject(GAIN, gain, 1000.0), changed_gains.GainObject(INTEGRAL, integral, 1000.0),
+        lambda measured: decided,
+    )  # fmt: skip
+    assert lasted[:3] == [False, *(not asks,) * 2] and not lasted[0]
+    assert lasted.count(True) == (lasted.count(False) - 1 if asks and not decided else 0 if asks else len(lasted) - 1)
     assert bool(pulses) != asks and measured.by_asked == asks
     assert bool(put) != bool(at_bound)
     if at_bound:

@@ -11,7 +11,7 @@ import pytest
 from pmsmtool.axis.drive import CURRENT, PID, AxisRequest
 from pmsmtool.axis.move import Profile
 from pmsmtool.commissioning.axis_design import design_axis
-from pmsmtool.commissioning.move import DESIGNED, HELD, foretold_move, limits_of_move
+from pmsmtool.commissioning.move import DESIGNED, HELD, followable, foretold_move, limits_of_move
 from pmsmtool.design.tune import tune
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive_maps.shipped_maps import load_family
@@ -45,6 +45,14 @@ def test_a_move_is_foretold_with_the_gains_that_the_drive_holds() -> None:
     assert behind.current_share == pytest.approx(0.15, rel=0.2) and ours.current_share == theirs.current_share == 1.0
     assert "without --axis first" in behind.lines(math.pi)[-1], "what it counts on was written by nobody"
     assert behind.error_most_rad > FURTHER_BEHIND * ours.error_most_rad
+    assert followable(design, drive_map, {}, WAY_RAD, SLOW, LIMIT_APK) == (SLOW, "")
+    much_behind = {name: design[name] / 7.0**power for name, power in zip(PID, (2, 3, 1), strict=False)}
+    slower, said = followable(design, drive_map, much_behind, WAY_RAD, SLOW, LIMIT_APK)
+    assert said.startswith(f"slower, with {slower.speed / SLOW.speed:.2g} of")
+    assert slower.speed / SLOW.speed == pytest.approx(slower.acceleration / SLOW.acceleration) and slower != SLOW
+    assert foretold_move(design, drive_map, much_behind, WAY_RAD, slower, LIMIT_APK).error_most_rad < 0.5 * WAY_RAD
+    stuck = replace(design, machine=replace(source, machine=replace(source.machine, tau_c_nm=1e3)))
+    assert "longer way (--by)" in followable(stuck, drive_map, {}, WAY_RAD, SLOW, LIMIT_APK)[1], "friction holds it"
     within = limits_of_move(design, LIMIT_APK, None, 12.0)
     assert within.acceleration == 12.0 and within.speed == design.facts["axis_speed_rad_s"]
     with pytest.raises(ConfigError, match="not a design of an axis"):

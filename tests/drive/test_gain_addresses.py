@@ -3,12 +3,17 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from pmsmtool.drive.objects import DriveObject
 from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import NotAvailable
+from pmsmtool.identification.learned_gains import Learned
 from pmsmtool.measurement.changed_gains import DOWN, GAIN, INTEGRAL, changed_counts, gain_address, gain_object
+from pmsmtool.measurement.learn_position_gain import DERIVATIVE, POSITION
+from pmsmtool.measurement.learned_rows import measured_row
 from tests.drive.table_drive import node_of
 
 
@@ -38,6 +43,18 @@ def test_a_drive_without_such_an_object_is_told_so(family: str, named: str) -> N
         with pytest.raises(NotAvailable) as caught:
             gain_address(node, GAIN)
         assert named in caught.value.what and "0xINDEX:SUB" in caught.value.hint
+
+
+def test_the_reason_s_limits_go_into_the_measured_row() -> None:
+    """A gain of 300 counts was designed for an object that takes 255: the drive refused it when it was written."""
+    held = {DriveObject(0x2332, sub, "H"): 20.0 for sub in (1, 2)}
+    with node_of(held, load_family("faulhaber")) as (_, node):
+        found = [gain_object(node, name, 0x2332, sub) for sub, name in ((1, POSITION), (2, DERIVATIVE))]
+    assert [gain.limits for gain in found] == [(1.0, 255.0)] * 2
+    cell = measured_row(found[0], Learned(POSITION, 0.1, 0.05, "value", "1/s")).cell()
+    assert (cell.low, cell.largest) == (1.0, 255.0)
+    with node_of(held, load_family("copley")) as (_, node):
+        assert gain_object(node, POSITION, 0x2332, 1).limits == (-math.inf, math.inf)
 
 
 def test_a_gain_that_is_a_float_is_changed_as_one() -> None:

@@ -3,14 +3,19 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
+from unittest.mock import MagicMock
 
 import pytest
 
+from pmsmtool.sim.foreign.behind import Behind, PositionGains
 from pmsmtool.sim.foreign.drive import ForeignDrive
+from pmsmtool.sim.foreign.position import PositionLoop
 from tests.cli.conftest import Tool
 from tests.foreign.data_sheets import Row, unknown, write_eds
 
@@ -77,3 +82,20 @@ def test_a_speed_that_shows_nothing_or_magnitudes_is_no_unit(
     sim = ("--sim", f"interior-2k2?nv=:memory:&eds={eds}")
     code, _, said = tool(*sim, "--yes", "move", "--by", "90deg", "--speed-max", "800rpm", "--settle", "0.2s")
     assert code == 0 and "times the speed" not in said, said
+
+
+def test_a_derivative_part_adds_its_share_of_the_speed_of_the_error() -> None:
+    """Of a Faulhaber (0x2332:02): as assumed, it acts on the following error beside the gain of the position."""
+    pushed: list[float] = []
+    behind = SimpleNamespace(
+        position=lambda per_turn: 0.0, position_gains=PositionGains(2.0, 0.0, 10.0), velocity_ff=0.0, direction=1.0,
+        acceleration_ff_s=0.0, derivative_share=0.5, push=pushed.append,
+        set_up=SimpleNamespace(i_max_apk=1e6, torque_constant=1.0),
+    )  # fmt: skip
+    loop = PositionLoop(cast(Behind, behind), MagicMock(), MagicMock(), MagicMock(), 4096.0, 60.0, 1e-3)
+    loop._running, loop._enabled = True, lambda: True  # type: ignore[method-assign]
+    for demand in (0.0, 0.001, 0.001):
+        loop._reference = lambda demand=demand: (demand, 0.0, 0.0)  # type: ignore[method-assign, misc]
+        loop._tick()
+    error = 2.0 * math.pi * 0.001
+    assert pushed == pytest.approx([0.0, 2.0 * (10.0 * error + 0.5 * error / 1e-3), 2.0 * 10.0 * error])

@@ -118,6 +118,8 @@ class Behind:
     velocity_ff: float = 0.0
     acceleration_ff_s: float = 0.0
     """Share of a move's speed that a cascade adds to its speed reference, and how many seconds of its acceleration."""
+    derivative_share: float = 0.0
+    """Share of the speed of the following error that it adds."""
     position_gains: PositionGains = field(init=False)
     """Of the position modes."""
     _turns_off: int = field(default=0, init=False)

@@ -33,8 +33,13 @@ POSITION_OBJECTS: tuple[tuple[Address, Address | None], ...] = (
     ((0x3210, 1), (0x3210, 11)),
     ((0x2382, 1), None),
     ((0x60FB, 1), (0x60FB, 2)),
+    ((0x2332, 1), None),
 )
-"""Position gain and feed-forward of the speed: Nanotec, ZeroErr, Copley; a controller of the position has neither."""
+"""Position gain and feed-forward of the speed: Nanotec, ZeroErr, Copley, Faulhaber; a controller of the position has
+neither."""
+DERIVATIVE_OBJECT: Address = (0x2332, 2)
+"""Derivative part beside the position gain of a Faulhaber. That it acts on the following error, and adds to the
+reference of the speed as the gain does, is assumed: the EDS names it, and no more (rauc-lab/being MCLM3002P-CO.eds)."""
 ACCELERATION_OBJECT: Address = (0x60FB, 3)
 """Acceleration that a Copley adds to the reference of its speed (CME 2 user guide, 11.7: position loop gains)."""
 CURRENT_OBJECTS: tuple[Address, Address] = ((0x60F6, 1), (0x60F6, 2))
@@ -50,6 +55,8 @@ POSITION_RATE = (0.15, 0.3)
 FORWARD = (0.0, 0.5, 1.0)
 """Shares of the speed that are fed forward, where the drive has an object for it, and of J / K_p of the acceleration.
 """
+DERIVATIVE = (0.0, 0.2, 0.5)
+"""Shares of the speed of the error that the derivative part adds."""
 FILTER_HZ = (120.0, 1000.0)
 DECIMATION = (4, 20)
 CURRENT_BANDWIDTH = (0.08, 0.3)
@@ -102,6 +109,9 @@ class DrawnGains:
     acceleration_counts: int = 0
     acceleration_ff_s: float = 0.0
     """Of the object of the acceleration: what it holds at first, and one count (s); 0: none."""
+    derivative_counts: int = 0
+    derivative_share: float = 0.0
+    """Of the object of the derivative part: what it holds at first, and one count (speed over that of the error)."""
     current: DrawnGains | None = None
     """Of the current loops, where the drive has objects of them and a trace: V/A, and V/(A s), 1/s or s."""
 
@@ -132,6 +142,8 @@ class DrawnGains:
         if self.acceleration_ff_s:
             counts = self.acceleration_counts
             yield Law(*ACCELERATION_OBJECT, SOURCE, set_up=counts, act=self._act_on_acceleration)
+        if self.derivative_share:
+            yield Law(*DERIVATIVE_OBJECT, SOURCE, set_up=self.derivative_counts, act=self._act_on_derivative)
         kind = RMS if self.rms else 1.0
         own = dict.fromkeys(EPOS2_CURRENTS, 1.0) if (0x2027, 0) in laws else {}
         if (0x2333, 1) in laws:
@@ -163,6 +175,9 @@ class DrawnGains:
 
     def _act_on_acceleration(self, behind: Behind, counts: float) -> None:
         behind.acceleration_ff_s = self.acceleration_ff_s * counts
+
+    def _act_on_derivative(self, behind: Behind, counts: float) -> None:
+        behind.derivative_share = self.derivative_share * counts
 
 
 def _scaled(law: Law, factor: float) -> Law:
@@ -222,11 +237,17 @@ def _with_position(drawn: DrawnGains, bandwidth: float, chance: random.Random, o
     counts = round(_between(chance, *_room(objects, position)))
     K_v = bandwidth * _between(chance, *POSITION_RATE) / counts
     share = chance.choice(FORWARD)
+    drawn = replace(drawn, position=position, position_counts=counts, K_v_per_s=K_v)
+    if objects.has(DERIVATIVE_OBJECT):
+        own = random.Random(f"derivative {drawn.counts} {counts}")
+        full = round(_between(own, *_room(objects, DERIVATIVE_OBJECT)))
+        held = max(1, round(own.choice(DERIVATIVE) * full))
+        drawn = replace(drawn, derivative_counts=held, derivative_share=1.0 / full)
     if forward is None or not objects.has(forward):
-        return replace(drawn, position=position, position_counts=counts, K_v_per_s=K_v)
+        return drawn
     full = round(_between(chance, *_room(objects, forward)))
     drawn = replace(
-        drawn, position=position, position_counts=counts, K_v_per_s=K_v, forward=forward,
+        drawn, forward=forward,
         forward_counts=round(share * full), forward_share=1.0 / full,
     )  # fmt: skip
     if not objects.has(ACCELERATION_OBJECT):

@@ -209,6 +209,8 @@ class PositionLoop:
             seen = TURN * (self._at - before) / self._T
             ahead = speed * self.behind.velocity_ff + acceleration * self.behind.acceleration_ff_s
             slip = gains.K_v * error + TURN * ahead - seen
+            slip += self.behind.derivative_share * (error - self._error) / self._T
+            self._error = error
             torque, gain = gains.K_p * slip, gains.K_i
         torque += TURN * (gains.inertia_ff * acceleration + gains.friction_ff * speed)
         most = self.behind.set_up.i_max_apk * self.behind.set_up.torque_constant
