@@ -160,8 +160,11 @@ def test_a_residual_widens_or_is_a_share_of_the_response(
     wave = size * response / 0.01 / np.std(wave) * wave
     fit = _fit(L_D, chi2=chi2, residuals=(wave,))
     with nullcontext() if expected else pytest.raises(IdentificationError, match="E_MODEL_MISMATCH"):
-        found = inductance._widening(fit, [shot], 0.01, "s")
+        found = inductance._widening(fit, [shot], 0.01, "d")
         assert expected is not None and found == (expected[0], *(pytest.approx(x, rel=1e-6) for x in expected[1:]))
+    verdict, *beside = expected or (Verdict.WARN, math.sqrt(chi2), size)
+    found = inductance._widening(fit, [shot], 0.01, "q")
+    assert found == (verdict, *(pytest.approx(x, rel=1e-6) for x in beside))
 
 
 def test_eddy_currents_are_doubted_by_what_they_leave() -> None:
@@ -370,6 +373,24 @@ def test_the_deviation_of_an_inductance_is_that_of_its_fit_and_of_what_none_sees
     assert (found.sampling is None) is (instant is None)
     if instant:
         assert found.sampling == Sampling(pytest.approx(0.04 * T_S), 0.0)  # type: ignore[arg-type]
+
+
+def test_a_q_axis_that_no_model_describes_leaves_the_d_axis_and_the_instant_to_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    shot, k = _shot(), np.arange(240)
+    response = float(np.std(inductance.projected(shot.i_a[SKIP_SAMPLES:], shot.slow_basis())))
+    fits = {"d": _fit(L_D, delay=0.97, places=((1.0, 0.97, 0.0),)), "q": _fit(L_Q, delay=0.96)}
+    calm = _estimated(monkeypatch, fits, instant=SHOWN)
+    for share, delay in ((0.04, 0.96), (0.3, 0.97)):
+        swing = share * response / 0.01 * np.where(k // 6 % 2 == 0, 1.0, -1.0)
+        fits["q"] = _fit(L_Q, delay=0.96, chi2=900.0, residuals=(swing,), places=((1.0, 0.96, 0.0),))
+        found = _estimated(monkeypatch, fits, instant=SHOWN)
+        assert (found.L_d.value, found.L_q.value) == (calm.L_d.value, calm.L_q.value)
+        assert found.L_d.std == pytest.approx(calm.L_d.std, rel=1e-3)
+        assert found.L_q.std == pytest.approx(math.hypot(calm.L_q.std, share * L_Q), rel=0.03)  # the frame mixes in 2 %
+        assert found.sampling == Sampling(pytest.approx((1.0 - delay) * T_S), 0.0)  # type: ignore[arg-type]
+        assert found.samplings == ((1.0, found.sampling),)
 
 
 def test_two_frequencies_that_differ_by_a_percent_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
