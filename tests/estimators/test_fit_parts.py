@@ -451,9 +451,8 @@ def test_friction_is_the_mean_of_models_with_and_without_drag(
     traces = [trace_of(t, {"coasting": k % 2 == 1}, theta_M_rad=0.01 * np.floor(1e2 * (t + t * t)), flagged=0.0 * t)
               for k in range(4)]  # fmt: skip
     found = mechanics.estimate_mechanics(traces, lambda d, q: q, 1.0, 0.01, 0.02, tolerance=SENSORS, elastic=elastic)
-    free = [k for k in range(len(with_drag.x)) if k not in driving]
-    taken = with_drag.jacobian[:, list(driving)] @ with_drag.x[list(driving)]
-    others, left, *_ = np.linalg.lstsq(with_drag.jacobian[:, free], taken)
+    free, held = [k for k in range(len(with_drag.x)) if k not in driving], list(driving)
+    others, left, *_ = np.linalg.lstsq(with_drag.jacobian[:, free], with_drag.jacobian[:, held] @ with_drag.x[held])
     braking = np.zeros(len(with_drag.x))
     braking[free] = with_drag.x[free] + others
     more = float(left[0])
@@ -462,11 +461,12 @@ def test_friction_is_the_mean_of_models_with_and_without_drag(
     moved = 0.5 * (with_drag.x - braking)[:3] if more > 2.0 * COVERAGE_FACTOR**2 else np.zeros(3)
     assert (-3e-5 in driving.values()) is bool(0.0 < more < 2.0 * COVERAGE_FACTOR**2), "both sides of the limit"
     bounds = [np.sqrt(np.diag(np.linalg.inv(fit.jacobian.T @ fit.jacobian)))[:3] for fit in (without, with_drag)]
-    pairs = list(zip(without.x[:3], braking[:3], strict=True))
-    means = [(1.0 - p) * a + p * b for a, b in pairs]
-    variances = [(1.0 - p) * bounds[0][k] ** 2 + p * bounds[1][k] ** 2 + p * (1.0 - p) * (b - a) ** 2
-                 for k, (a, b) in enumerate(pairs)]  # fmt: skip
-    stds = [math.sqrt(2.0 * (variance + part**2)) for variance, part in zip(variances, moved, strict=True)]
+    means = (without.x[:3] + p * (apart := braking[:3] - without.x[:3])).tolist()
+    covariance = np.linalg.inv(with_drag.jacobian.T @ with_drag.jacobian)[:4, :4]
+    alone, dearer = mechanics._held_at_zero(with_drag.x[:4], covariance, (1, 3, 2), without=1)
+    dearer += with_drag.cost - min(without.cost, with_drag.cost + more + mechanics.DRAG_PENALTY)
+    spread = p * (1.0 - p) * apart**2 + moved**2 + 0.5 * (1.0 - math.tanh(0.25 * dearer)) * (alone[:3] - means) ** 2
+    stds = np.sqrt(2.0 * ((1.0 - p) * bounds[0] ** 2 + p * bounds[1] ** 2 + spread)).tolist()
     J = math.exp(means[0])
     scale = math.hypot(0.02, mechanics.SCALE_FLOOR)
     for one, value, std in ((found.J, J, J * stds[0]), (found.B, means[1], stds[1]), (found.tau_c, means[2], stds[2])):

@@ -20,6 +20,7 @@ from pmsmtool.estimators.shaft.mechanics import (
     REST_SHARE,
     RIPPLE_MOST,
     MechanicsResult,
+    _held_at_zero,
     _start,
     _window,
     estimate_mechanics,
@@ -344,6 +345,28 @@ def test_a_drag_that_is_nearly_lost_in_the_noise_is_in_the_intervals() -> None:
     found = estimate(with_drag(run_of(np.random.default_rng(106)), 3.4e-8))
     for value, true in ((found.B, B), (found.tau_c, TAU_C)):
         assert abs(value.value - true) < 1.8 * 1.96 * value.std  # measured 1.58
+
+
+@pytest.mark.chain
+def test_a_coasting_through_few_speeds_may_hold_a_drag_in_place_of_viscous_friction(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """All of B is then in its interval, as far as a drag alone explains the traces, too: 0.2 of it before, 0.57 now."""
+    monkeypatch.setattr(f"{__name__}.B", 5e-5)
+    monkeypatch.setattr(f"{__name__}.BITS", 13)
+    traces = with_drag(run_of(np.random.default_rng(2)), 3e-8)
+    found = estimate([t.rows(slice(0, 160)) if t.meta["coasting"] else t for t in traces])
+    assert found.drag is None and 0.5 * found.B.value < found.B.std < found.B.value
+
+
+def test_least_squares_without_one_friction_cost_what_it_was_in_deviations() -> None:
+    rng = np.random.default_rng(3)
+    rows = rng.standard_normal((20, 4))
+    y = rows @ np.array([1.0, 0.4, 0.6, 0.5])
+    found, cost = _held_at_zero(np.array([1.0, 0.4, 0.6, 0.5]), np.linalg.inv(rows.T @ rows), (1, 3, 2), without=1)
+    x, misfit, *_ = np.linalg.lstsq(np.delete(rows, 1, axis=1), y, rcond=None)
+    assert np.delete(found, 1) == pytest.approx(x, rel=1e-9) and found[1] == 0.0
+    assert cost == pytest.approx(float(misfit[0]), rel=1e-9)
 
 
 @pytest.mark.chain

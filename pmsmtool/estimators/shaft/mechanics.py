@@ -250,7 +250,11 @@ def estimate_mechanics(
     apart, moved = x_drag[:SHAFT] - x, 0.5 * falls * (with_drag.x[:SHAFT] - x_drag[:SHAFT])
     ln_J, B, tau_c = (x + share * apart).tolist()
     own = (1.0 - share) * np.diag(covariance)[:SHAFT] + share * np.diag(of_drag)[:SHAFT]
-    deviations = (widen * np.sqrt(own + share * (1.0 - share) * apart**2 + moved**2)).tolist()
+    # a coasting through few speeds does not tell a drag from viscous friction: B may then be none
+    of_none, more_none = _held_at_zero(with_drag.x[: SHAFT + 1], of_drag, (1, SHAFT, 2), without=1)
+    none = float(information_weights((min(criteria), with_drag.cost + more_none))[1])
+    instead = none * (of_none[:SHAFT] - (x + share * apart)) ** 2
+    deviations = (widen * np.sqrt(own + share * (1.0 - share) * apart**2 + moved**2 + instead)).tolist()
     J, stds = math.exp(ln_J), (math.exp(ln_J) * deviations[0], deviations[1], deviations[2])
     require_useful(noisy, stds[1], stds[2])
     drag = None
@@ -300,11 +304,16 @@ def mean_mechanics(
     }
 
 
-def _held_at_zero(x: Array, covariance: NDArray[np.float64], friction: Sequence[int]) -> tuple[Array, float]:
-    """Return least squares with friction at zero that came out below it, where it would drive, and their added cost."""
+def _held_at_zero(
+    x: Array, covariance: NDArray[np.float64], friction: Sequence[int], without: int = 0
+) -> tuple[Array, float]:
+    """Return least squares with friction at zero that came out below it, where it would drive, and their added cost.
+
+    ``without`` is the index of one that is held there whatever it came out, 0 for none.
+    """
     cost = 0.0
     for k in friction:
-        if x[k] < 0.0:
+        if x[k] < 0.0 or k == without > 0:
             column = covariance[:, k] / covariance[k, k]
             cost += float(x[k]) ** 2 / float(covariance[k, k])
             x, covariance = x - column * x[k], covariance - np.outer(column, covariance[k])
