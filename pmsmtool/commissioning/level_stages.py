@@ -27,6 +27,7 @@ from pmsmtool.design.loops.designed_loops import CURRENT_LOOPS, lacking_gains
 from pmsmtool.design.loops.margins import MarginRequest
 from pmsmtool.design.tune_request import TuneRequest
 from pmsmtool.drive.canopen_drive import CanopenDrive
+from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
 from pmsmtool.flash.download import NO_STORE
 from pmsmtool.flash.journal import JournalFolder
@@ -42,6 +43,7 @@ from pmsmtool.measurement.by_vendor import vendor_line
 from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel
 from pmsmtool.measurement.identify import OF_LEVEL, SET_UP, identify, identify_after_drive
 from pmsmtool.measurement.limits import Allow, Say
+from pmsmtool.params.parameter_set import read_parameter_set
 from pmsmtool.proof.plan import HALLS_ALONE
 from pmsmtool.proof.stage import ProofRequest, prove_stage
 from pmsmtool.report.verdict import ENCODER_SIGN
@@ -192,7 +194,8 @@ class LevelStages:
         stage = lut_stage(self.run, request)
         if self.found.drive_map.tables:
             return stage
-        return replace(stage, fallbacks=(*stage.fallbacks, FOR_READING), summary=f"{stage.summary}; {FOR_READING}")
+        notes = [FOR_READING, *_without_base(self.run, self.found.drive_map)]
+        return replace(stage, fallbacks=(*stage.fallbacks, *notes), summary=f"{stage.summary}; {FOR_READING}")
 
     def margins(self, request: MarginRequest) -> Stage:
         """Judge the design over what the machine may be, as far as the drive takes its gains."""
@@ -331,6 +334,20 @@ def _wrong_sign(run: RunDirectory) -> str:
     if identified is None or ENCODER_SIGN not in identified.refused:
         return ""
     return f"{ENCODER_SIGN} WRONG: swap two motor leads, or the encoder's tracks; then begin a new run"
+
+
+def _without_base(run: RunDirectory, drive_map: DriveMap) -> list[str]:
+    """Leave out of the set what the drive counts relative to a value the set does not have; say so.
+
+    What it counts by the torque of an ampere, or by its increments, stays: the list of differences names it.
+    """
+    wanted = read_parameter_set(run.path / "params.toml")
+    cells = (drive_map.cells[name] for name in wanted.values if name in drive_map.cells)
+    left = {c.name: c.gain for c in cells if c.gain and c.gain not in wanted.values and not drive_map.scale_of(c)}
+    if left:
+        values = {name: value for name, value in wanted.values.items() if name not in left}
+        run.save("params.toml", replace(wanted, values=values).to_toml())
+    return [f"{name} stays as it is: counted relative to {base} (`pmsmtool tune --map`)" for name, base in left.items()]
 
 
 def _machine_needed(names: Sequence[str]) -> str:
