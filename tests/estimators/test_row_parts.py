@@ -263,6 +263,8 @@ def test_an_encoder_s_error_is_fitted_about_what_a_slow_rotation_shows() -> None
         assert h.std == pytest.approx(sum(weights) ** -0.5)
     theta = np.linspace(0.0, 1.0, 9)
     found = disturbances.disturbances(theta, np.ones(8), 0.1, Extent(1.0, 1.0, 0.0, prior), 5)
+    along = disturbances.disturbances(theta, np.ones(8), 0.1, Extent(1.0, 1.0, 0.0, prior, (9,)), 5)
+    assert along.orders == (9,) and not found.orders and along.torque.shape[1] == found.torque.shape[1] + 2
     assert found.position[:, -4] == pytest.approx(prior[0].std * np.cos(theta), abs=1e-9)
     unknown = replace(turned[1], std=math.inf)
     assert tuple(disturbances.encoder_prior((turned[0], unknown), 2))[1] == UNKNOWN[1]

@@ -240,6 +240,8 @@ def test_slow_modes_ask_for_noise_that_the_mean_of_all_hides() -> None:
             factors = (min(push, coasting), coasting, coasting)
             assert [run.torque_std / 0.01 for run in found] == pytest.approx(factors, rel=EXACT)
             assert model.noisier(runs, np.tile(part, 3)) is runs
+    part = np.asarray(idct(20.0 * np.eye(250)[33], norm="ortho"))
+    assert model.noisier(runs, np.tile(part, 3), slow=True) is runs, "beyond the slow modes, an eighth of all"
 
 
 def test_orders_of_a_cogging_stand_out_of_a_residual_beside_what_its_fit_takes() -> None:
@@ -332,6 +334,8 @@ def test_what_a_reader_is_told_of_the_torque() -> None:
     told = result(harmonics=cogging, drag=drag, unexplained=False).note
     assert told == ("drag over the square of the speed, 1.5e-06 N m s2, is in neither B nor tau_c; "
                     "cogging of 0.01 N m (orders per turn: 6, 12) was taken out of J, B and tau_c")  # fmt: skip
+    along = result(orders=(15, 30), unexplained=False).note
+    assert along.startswith("cogging (orders per turn: 15, 30), of which the coasting is too short")
 
 
 # ---- lines of a frequency response ------------------------------------------------------------------------------

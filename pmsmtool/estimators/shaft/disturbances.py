@@ -59,6 +59,8 @@ class Disturbances:
 
     torque: Array
     position: Array
+    orders: Sequence[int] = ()
+    """Per turn, of the cogging among them."""
 
 
 NONE = Disturbances(np.zeros((0, 0)), np.zeros((0, 0)))
@@ -145,4 +147,5 @@ def disturbances(theta: Array, torque: Array, T: float, extent: Extent, pole_pai
     return Disturbances(
         np.column_stack([*torques, np.zeros((blocks, len(positions)))]),
         np.column_stack([np.zeros((blocks + 1, len(torques))), *positions]),
+        extent.orders,
     )

@@ -121,6 +121,8 @@ class MechanicsResult:
     """Cogging torque and encoder error that were taken out."""
     drag: Estimate | None = None
     """Torque per square of the speed (N m s2), where the data ask for it: it is in neither B nor tau_c."""
+    orders: Sequence[int] = ()
+    """Of a cogging (per turn) that a coasting of less than a turn hides, and that was fitted along."""
 
     @property
     def note(self) -> str:
@@ -132,6 +134,11 @@ class MechanicsResult:
             orders = ", ".join(f"{h.order}" for h in self.harmonics.acceleration_rad_s2)
             torque = max(h.amplitude for h in self.harmonics.acceleration_rad_s2) * self.J.value
             lines.append(f"cogging of {torque:.3g} N m (orders per turn: {orders}) was taken out of J, B and tau_c")
+        if self.orders:
+            lines.append(
+                f"cogging (orders per turn: {', '.join(map(str, self.orders))}), of which the coasting is too short to "
+                "tell more, was fitted along with J, B and tau_c"
+            )
         if self.unexplained and self.ripple >= NOTED:
             lines.append(
                 f"J, B and tau_c: torque noise of {100.0 * self.ripple:.2g} % of that of the pulses, counted in "
@@ -268,7 +275,8 @@ def estimate_mechanics(
         for value, std, unit, alone in zip((J, B, tau_c), stds, MEANS.values(), without.x, strict=False)
     )  # fmt: skip
     ripple, unexplained = max(torque_noise(noisy).values()), _unexplained(blocks, noisy)
-    return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, unexplained, harmonics, drag)
+    orders = blocks[0].disturbances.orders
+    return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, unexplained, harmonics, drag, orders)
 
 
 def mean_mechanics(
