@@ -335,7 +335,7 @@ def test_what_a_reader_is_told_of_the_torque() -> None:
     assert told == ("drag over the square of the speed, 1.5e-06 N m s2, is in neither B nor tau_c; "
                     "cogging of 0.01 N m (orders per turn: 6, 12) was taken out of J, B and tau_c")  # fmt: skip
     along = result(orders=(15, 30), unexplained=False).note
-    assert along.startswith("cogging (orders per turn: 15, 30), of which the coasting is too short")
+    assert along.startswith("cogging (orders per turn: 15, 30), which so short a coasting")
 
 
 # ---- lines of a frequency response ------------------------------------------------------------------------------

@@ -136,8 +136,8 @@ class MechanicsResult:
             lines.append(f"cogging of {torque:.3g} N m (orders per turn: {orders}) was taken out of J, B and tau_c")
         if self.orders:
             lines.append(
-                f"cogging (orders per turn: {', '.join(map(str, self.orders))}), of which the coasting is too short to "
-                "tell more, was fitted along with J, B and tau_c"
+                f"cogging (orders per turn: {', '.join(map(str, self.orders))}), which so short a coasting does not "
+                "show alone, was fitted along with J, B and tau_c"
             )
         if self.unexplained and self.ripple >= NOTED:
             lines.append(
