@@ -117,6 +117,7 @@ class LearnedLoop:
 
 
 Decided = Callable[[LearnedLoop], bool]
+"""Whether what was measured decides the unit of every gain that it can decide."""
 
 
 def high_share(node: DriveNode) -> float:
@@ -138,8 +139,10 @@ def largest_speed(node: DriveNode, file: MachineFile) -> float:
     return UNLIMITED_SHARE * (min(top, file.inverter.U_dc_v * LINEAR_UTILISATION / flux) if flux > 0.0 else top)
 
 
-def within_budget(node: DriveNode, acceleration: float | None, room_rad_s: float, seen_s: float) -> float:
-    """Return the share of a current, accelerating the shaft so (rad/s2), that needs a time for a rise of the speed.
+def share_of_current(node: DriveNode, acceleration: float | None, room_rad_s: float, seen_s: float) -> float:
+    """Return the largest share of a current with which the shaft needs ``seen_s`` (s) for a rise by ``room_rad_s``.
+
+    ``acceleration``: what the whole current gives (rad/s2); None: not known, and nothing is cut.
 
     The drive's own loop keeps the speed, also when the tool is dead; this is for a loop that runs away, until it is
     seen and the voltage off. A drive with a speed limit of its own keeps it; of any other the current is cut.
@@ -163,7 +166,7 @@ def learning_envelope(
     speed_max = speed_max_rad_s or largest_speed(drive.node, file)
     i_max = i_max_apk or min(drive.rated_apk, drive.shows_apk)
     room = (MOST - TRIP_UNLIMITED) * speed_max
-    i_max *= within_budget(drive.node, largest_acceleration(machine, i_max), room, SEEN_S)
+    i_max *= share_of_current(drive.node, largest_acceleration(machine, i_max), room, SEEN_S)
     return Envelope(
         i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S, shaft=shaft or "free", load=load,
         brake=brake, acceleration_rad_s2=largest_acceleration(machine, i_max),
@@ -291,9 +294,10 @@ class _Learner:
     def run(self, gain: GainObject, integral: GainObject, decided: Decided) -> LearnedLoop:
         """Measure everything; with longer records once more where everything was changed and that did not decide."""
         step, counts = self.prepare(gain, integral)
+        prepared = list(self.notes)
         measured = self.observe(gain, integral, step, counts)
         if not self.long and measured.gain_changed and measured.integral_changed and not decided(measured):
-            self.long = True
+            self.long, self.notes = True, prepared
             measured = self.observe(gain, integral, step, counts)
         return measured
 

@@ -42,7 +42,7 @@ from pmsmtool.measurement.changed_gains import (
     named_addresses,
     refuse_unsafe,
 )
-from pmsmtool.measurement.learn_gains import MOST, within_budget
+from pmsmtool.measurement.learn_gains import MOST, share_of_current
 from pmsmtool.trace import Trace
 
 POSITION = "position.K_p_per_s"
@@ -140,7 +140,7 @@ def _moved(
     if not limits_speed(node):
         limit = envelope.speed_max_rad_s
         speed = min(FASTEST * SPEED_RAD_S, limit)
-        share = within_budget(node, envelope.acceleration_rad_s2, MOST * limit - speed, UNWATCHED_S)
+        share = share_of_current(node, envelope.acceleration_rad_s2, MOST * limit - speed, UNWATCHED_S)
         envelope = replace(envelope, speed_max_rad_s=speed, i_max_apk=share * envelope.i_max_apk)
     way = WAY_RAD
     with changing(drive, written, envelope, say) as (guard, put):

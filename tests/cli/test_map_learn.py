@@ -341,10 +341,17 @@ def test_the_predicted_margin_counts_on_the_integral_part_that_the_loop_asks_for
 
 
 @pytest.mark.parametrize(
-    ("asks", "at_bound", "decided"), [(True, "", True), (True, "", False), (False, "", False), (False, "lag", False)]
+    ("asks", "at_bound", "decided", "lost"),
+    [
+        (True, "", True, False),
+        (True, "", False, False),
+        (True, "", False, True),
+        (False, "", False, False),
+        (False, "lag", False, False),
+    ],
 )
 def test_records_are_long_where_short_ones_do_not_decide_and_nothing_is_changed_on_a_fit_at_a_bound(
-    asks: bool, at_bound: str, decided: bool, monkeypatch: pytest.MonkeyPatch
+    asks: bool, at_bound: str, decided: bool, lost: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """120 s under voltage for a Nanotec PD4-C, where half of them did."""
     lasted: list[bool] = []
@@ -355,8 +362,9 @@ def test_records_are_long_where_short_ones_do_not_decide_and_nothing_is_changed_
     def observe(self: Any, what: str, step: float, counts: Any, *known: Any) -> Observation:
         lasted.append(self.long)
         self.asks = asks
+        shown = asks and not (lost and "half" in what)
         return Observation(
-            counts[GAIN], counts[INTEGRAL], loop, asked=AskedLoop(loop, (0.0, 0.0, 0.0)) if asks else None
+            counts[GAIN], counts[INTEGRAL], loop, asked=AskedLoop(loop, (0.0, 0.0, 0.0)) if shown else None
         )
 
     monkeypatch.setattr(learn_gains, "find_speed_unit", lambda *arguments: 1e-3)
@@ -373,7 +381,8 @@ def test_records_are_long_where_short_ones_do_not_decide_and_nothing_is_changed_
     )  # fmt: skip
     assert lasted[:3] == [False, *(not asks,) * 2] and not lasted[0]
     assert lasted.count(True) == (lasted.count(False) - 1 if asks and not decided else 0 if asks else len(lasted) - 1)
-    assert bool(pulses) != asks and measured.by_asked == asks
+    assert bool(pulses) != asks and measured.by_asked == (asks and not lost)
+    assert len(set(measured.notes)) == len(measured.notes), "of the record that did not decide"
     assert bool(put) != bool(at_bound)
     if at_bound:
         assert measured.gain_changed is None and not measured.integral_changed
