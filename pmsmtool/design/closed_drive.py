@@ -82,22 +82,17 @@ class ClosedDrive:
     """Speed up to which the guarantee is to hold; None: where torque times speed is largest."""
     acceleration_rpm_per_s: float | None = None
     """Largest acceleration, whatever causes it; None: what the torque limit does to the least inertia."""
-    stair_s: float = STAIR_S
-    filter_s: float = 0.0
-    """Time between two steps of its slope; time constant of a set-point filter it is known to have."""
     decoupled: bool | None = None
     """Whether its current control adds omega (L i + psi); None: not known, both are held to."""
 
     def __post_init__(self) -> None:
         numbers = {"bandwidth_hz": self.bandwidth_hz, "rise_s": self.rise_s, "speed_rpm": self.speed_rpm,
-                   "acceleration_rpm_per_s": self.acceleration_rpm_per_s, "stair_s": self.stair_s}  # fmt: skip
+                   "acceleration_rpm_per_s": self.acceleration_rpm_per_s}  # fmt: skip
         wrong = [
             f"{name} = {value!r} is not a positive number"
             for name, value in numbers.items()
             if value is not None and not (math.isfinite(value) and value > 0.0)
         ]
-        if not (math.isfinite(self.filter_s) and self.filter_s >= 0.0):
-            wrong.append(f"filter_s = {self.filter_s!r} is negative")
         if wrong:
             raise ConfigError("the request cannot be used", where="drive with fixed firmware", violations=wrong)
         missing = [name for name in (RATED, SLOPE) if name not in self.offers]
@@ -248,7 +243,7 @@ def current_loops(design: Design, drive: ClosedDrive) -> CurrentLoops:
             hint="the guarantee covers up to 1.5 periods: correct inverter.delay_periods, or leave --map out",
         )
     K_p_d, K_i_d, K_p_q, K_i_q = (design[name] for name in CURRENT_GAINS)
-    return CurrentLoops((K_p_d, K_p_q), (K_i_d, K_i_q), inverter.T_s, whole, False, drive.stair_s, drive.filter_s)
+    return CurrentLoops((K_p_d, K_p_q), (K_i_d, K_i_q), inverter.T_s, whole, stair_s=STAIR_S)
 
 
 def machine_box(source: MachineFile, box: ToleranceBox) -> MachineBox:
@@ -327,7 +322,7 @@ class _Projection:
 
     def demand(self, I_apk: float, slope_a: float, speeds: int) -> tuple[float, float]:
         """Return bounds of the demand (V) and of the current's deviation (A)."""
-        stair = min(slope_a * self.drive.stair_s, 2.0 * I_apk)
+        stair = min(slope_a * STAIR_S, 2.0 * I_apk)
         rate = self.acceleration(I_apk)
         bounds = [one.largest_demand(I_apk, stair, rate, speeds) for one in self.responses]
         return max(float(demand.max()) for demand, _ in bounds), max(deviation for _, deviation in bounds)
@@ -372,7 +367,7 @@ class _Projection:
                 likely=f"without any torque the demand is bounded by {demand:.4g} V, the limit is {self.limit:.4g} V",
                 hint="ask for a lower speed, a longer rise, or a smaller acceleration",
             )
-        slope_a = _largest(lambda slope: self.holds(I_apk, slope, last + 1), 2.0 * I_apk / self.drive.stair_s)
+        slope_a = _largest(lambda slope: self.holds(I_apk, slope, last + 1), 2.0 * I_apk / STAIR_S)
         demand, deviation = self.demand(I_apk, slope_a, last + 1)
         machine = at_temperature(self.source.machine, self.source.flux_map)
         V = (1.0 - self.margin) * self.source.inverter.V_max_v

@@ -3,7 +3,7 @@
 
 Nothing is assumed of the reference but that it moves in stairs of a limited height, and of the speed that it changes at
 a limited rate; machine constants are anywhere in their intervals. Sampled model at a frozen speed w, rotor
-frame, d and q coupled: x = (i, voltage on its way, integrators, set-point filter), z = x - x_ss(w, r) obeys
+frame, d and q coupled: x = (i, voltage on its way, integrators), z = x - x_ss(w, r) obeys
 
     z(k+1) = A z(k) + B_r step(k) + B_w (w(k+1) - w(k)) + B_p E z(k),
 
@@ -54,8 +54,6 @@ class CurrentLoops:
     """Whether it adds omega (L i + psi) of its own motor data."""
     stair_s: float = 1e-3
     """Time between two steps of its torque slope (s)."""
-    filter_s: float = 0.0
-    """Time constant of its set-point filter, 0 without one (s)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,8 +184,8 @@ class _Model:
     u_psi: Array
 
 
-_STATES = 7
-"""i_d, i_q, two voltages on their way, two integrators, the filter's distance from its end."""
+_STATES = 6
+"""i_d, i_q, two voltages on their way, two integrators."""
 
 
 def _model(constants: Sequence[float], omega: Array, loops: CurrentLoops, own: MachineBox) -> _Model:
@@ -201,7 +199,7 @@ def _model(constants: Sequence[float], omega: Array, loops: CurrentLoops, own: M
         D[..., 0, 1], D[..., 1, 0] = -w * own_q, w * own_d
     K_p, K_i = np.diag(loops.K_p), np.diag(loops.K_i)
     C = np.zeros((*shape, 2, _STATES))
-    C[..., :2], C[..., 4:6], C[..., 1, 6] = D - K_p, np.eye(2), loops.K_p[1]
+    C[..., :2], C[..., 4:] = D - K_p, np.eye(2)
     A = np.zeros((*shape, _STATES, _STATES))
     A[..., :2, :2] = machine.Phi
     if loops.delay_periods:
@@ -209,10 +207,7 @@ def _model(constants: Sequence[float], omega: Array, loops: CurrentLoops, own: M
     else:
         A[..., :2, :] += machine.Gamma @ C
     A[..., 2:4, :] = C
-    A[..., 4:6, :2], A[..., 4:6, 4:6] = -loops.T_s * K_i, np.eye(2)
-    A[..., 5, 6] = loops.T_s * loops.K_i[1]
-    beta = 1.0 if loops.filter_s == 0.0 else -np.expm1(-loops.T_s / loops.filter_s)
-    A[..., 6, 6] = 1.0 - beta
+    A[..., 4:, :2], A[..., 4:, 4:] = -loops.T_s * K_i, np.eye(2)
     E = np.zeros((*shape, 4, 4))
     E[..., :2, :2], E[..., :2, 2:], E[..., 2:, :2] = machine.Phi, machine.Gamma, D
     if not loops.delay_periods:
@@ -222,11 +217,11 @@ def _model(constants: Sequence[float], omega: Array, loops: CurrentLoops, own: M
     u_r = steady_voltage(machine, np.broadcast_to(unit_q, (*shape, 2)), np.zeros(shape))
     u_psi = steady_voltage(machine, nothing, np.ones(shape))
     X_r = np.zeros((*shape, _STATES))
-    X_r[..., 1], X_r[..., 2:4], X_r[..., 4:6], X_r[..., 6] = 1.0, u_r, u_r - D[..., :, 1], 1.0 - beta
+    X_r[..., 1], X_r[..., 2:4], X_r[..., 4:] = 1.0, u_r, u_r - D[..., :, 1]
     X_0 = np.zeros((*shape, _STATES, 2))
     forward = w * sum(own.psi) / 2.0 if loops.decoupled else np.zeros(shape)
     for k, psi in enumerate(own.psi):
-        X_0[..., 2:4, k] = X_0[..., 4:6, k] = psi * u_psi
+        X_0[..., 2:4, k] = X_0[..., 4:, k] = psi * u_psi
         X_0[..., 5, k] -= forward
     return _Model(A, C, E, X_r, X_0, u_r, u_psi)
 
