@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
+from functools import cache
 
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.drive_map_file import parse_drive_map
@@ -17,6 +18,7 @@ UNKNOWN_VENDOR = 0
 """Vendor of a map whose maker's number no source confirmed: it fits no real drive until a person fills it in."""
 
 
+@cache
 def family_names() -> tuple[str, ...]:
     """Return the families with a shipped map."""
     return tuple(sorted(path.parent.name for path in data_folder("firmware-params").glob(f"*/{MAP_NAME}")))
@@ -30,6 +32,12 @@ def load_family(name: str) -> DriveMap:
             f"no drive family {name!r}" + (f", did you mean {near[0]}?" if near else ""),
             hint=f"one of {', '.join(family_names())}, or the path of a map file",
         )
+    return _shipped_map(name)
+
+
+@cache
+def _shipped_map(name: str) -> DriveMap:
+    """Read a map once: a search by identity looks at all of them, 7 ms each."""
     path = data_folder("firmware-params") / name / MAP_NAME
     return parse_drive_map(path.read_text(encoding="utf-8"), str(path))
 
