@@ -26,7 +26,7 @@ EXIT_CODES: dict[ExitCode, str] = {
     ExitCode.USAGE: "wrong command line, or a file or folder that cannot be used",
     ExitCode.BUS: "no bus, no drive on it, or the connection was lost",
     ExitCode.DRIVE: "the drive is in fault, or refused a value (SDO abort)",
-    ExitCode.SAFETY: "refused by a safety limit before anything moved",
+    ExitCode.SAFETY: "refused by a safety limit before anything moved, or one was exceeded and the machine stopped",
     ExitCode.NOT_TRUSTWORTHY: "the measurement is not trustworthy, so no number is given (help refusals)",
     ExitCode.DECLINED: "declined at a prompt, or no terminal; what was asked about was not done",
     ExitCode.STOP_NOT_CONFIRMED: "STOP NOT CONFIRMED: the machine may be energised, use the hardware stop",

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -284,12 +284,17 @@ def _accounted(run: RunDirectory, out: Output) -> Iterator[Callable[[str], None]
         shutil.rmtree(run.path, ignore_errors=True)
         raise
     except BaseException:
+        stage = run.read().stage("identify")
+        if stage is not None and (stage.values or stage.refused):
+            _tell(run, stage, out, ended=True)
         out.note(f"how it ended, and what is complete: pmsmtool report {run.path}")
         raise
 
 
-def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison | None = None) -> None:
-
+def _tell(
+    run: RunDirectory, stage: Stage, out: Output, comparison: Comparison | None = None, *, ended: bool = False
+) -> Mapping[str, Mapping[str, Any]]:
+    """Tell what a stage holds, also one that an error ``ended``; return what became of the accuracy asked for."""
     from pmsmtool.identification.request import accuracy_line, accuracy_told
     from pmsmtool.report.report import total_interval
     from pmsmtool.report.verdict import on_which_drive
@@ -322,7 +327,7 @@ def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison |
     compared = [] if comparison is None else comparison.lines()
     data |= {} if comparison is None else {"fingerprint": comparison.facts()}
     out.result("identify", data, [*table(heads, rows), *compared])
-    for line in warnings:
+    for line in stage.fallbacks if ended else warnings:  # what ended it is said last
         out.warn(line)
     if accuracy and stage.status == "pass":
         out.note(accuracy_line(accuracy))  # one that is not reached is among the warnings
@@ -330,6 +335,13 @@ def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison |
     for name in stage.files:
         if not name.startswith(("traces/", "nameplate", "request")):
             out.note(f"-> {run.path / name}")
+    return accuracy
+
+
+def _show(run: RunDirectory, stage: Stage, out: Output, comparison: Comparison | None = None) -> None:
+    from pmsmtool.identification.request import accuracy_line
+
+    accuracy = _tell(run, stage, out, comparison)
     if comparison is not None:
         comparison.require_same(run)
     if stage.status == "pass" and comparison is not None:

@@ -122,6 +122,8 @@ class StageProgress:
         )
         seconds = f"  ({stage.seconds:.1f} s)" if stage.seconds >= 0.05 else ""
         self._out.note(f"[{number}/{count}] {stage.name:<9} {stage.status.upper()}  {text}{seconds}".rstrip())
+        if stage.name == "identify" and stage.values and text is not stage.summary:
+            self._out.note(f"      measured: {stage.summary}")
         if any(row["stated"] is not None for row in stage.comparison):
             from pmsmtool.cli.output import table
             from pmsmtool.report.comparison import HEADS, table_cells

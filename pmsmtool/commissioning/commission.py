@@ -244,7 +244,7 @@ class Commissioning:
 
     def _carry_out(self, name: str, number: int) -> None:
         clock = self.drive.node.connection.clock
-        start = clock.now()
+        start, recorded = clock.now(), len(self.run.read().stages)
         try:
             self.progress.begin(name, number, len(STAGES))
             unmoved = contradicted_unmoved(self.drive, self.nameplate, self._found) if name == "identify" else None
@@ -260,7 +260,10 @@ class Commissioning:
             failed = Stage(name, status_of(error), clock.now() - start, note=note)
             # The error that ended the stage outranks a record that cannot be written.
             with contextlib.suppress(ConfigError):
-                self.run.add(failed)
+                if kept := self.run.read().stages[recorded:]:  # with what it had measured
+                    failed = kept[-1]
+                else:
+                    self.run.add(failed)
             self.progress.end(failed, number, len(STAGES))
             raise
         self._settle(stage, number)

@@ -32,7 +32,7 @@ from pmsmtool.identification.request import (
     trace_files,
 )
 from pmsmtool.identification.sampling import timing_estimates, with_timing
-from pmsmtool.identification.verdicts import verdicts_of
+from pmsmtool.identification.verdicts import ENDED, verdicts_of
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.temperature import magnet_tolerance_per_k
 from pmsmtool.run_directory import RunDirectory, Stage
@@ -56,7 +56,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
     verdicts = verdicts_of(request.quantities, evaluation.refused, had, acceptance)
     tried = evaluation.flux_map is not None or "map" in evaluation.refused
     unasked = ("map",) if tried and "map" not in request.quantities else ()
-    if not verdicts.accepted:
+    if not verdicts.accepted and ENDED not in evaluation.refused:
         evaluation.whole()
     rejected = {key for key, line in acceptance.items() if not line.ok}
     kept = evaluation if "flux map" not in rejected else replace(evaluation, flux_map=None, map_estimates={})

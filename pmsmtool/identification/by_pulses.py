@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from pmsmtool.cia402 import LEAST_LINK_V
-from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, PmsmtoolError
 from pmsmtool.estimators.encoder import EncoderResult, estimate_encoder
 from pmsmtool.estimators.estimate import SENSOR_GAIN_TOLERANCE, SensorTolerance, total_half_width
 from pmsmtool.estimators.flux.linkage import normalised as flux_at_reference
@@ -201,7 +201,7 @@ def pulse_result(
     return PulseResult(estimates, missing | ({"offset_rad": facts.no_vector} if facts.no_vector else {}))
 
 
-def why_no_push(error: IdentificationError) -> str:
+def why_no_push(error: PmsmtoolError) -> str:
     """Return why the pushes told nothing."""
     return f"{error.what} (likely {error.likely})" if error.likely else error.what
 

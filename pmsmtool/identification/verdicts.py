@@ -47,6 +47,8 @@ ESSENTIAL = ("poles", "encoder")
 DESIGNED_FROM = ("R", "L", "psi")
 """Quantities without which it goes on only with a machine file that a person gave."""
 NOT_ACCEPTED = "E_NOT_ACCEPTED"
+ENDED = "run"
+"""Key beside the evaluations: why a run ended, for all that it did not reach."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,13 +118,21 @@ def _why(step: str, refused: Mapping[str, IdentificationError], had: set[str], a
             break
         root = lacking
     needs = "" if root == step else f"needs {root}: "
-    if root not in refused:
+    if root not in refused and ENDED not in refused:
         return f"{needs}not measured: the run ended before it"
-    error = refused[root]
+    error = refused.get(root) or refused[ENDED]
     if needs and any(STEP[quantity] == root for quantity in asked):
         return needs + error.reason  # told in full where it was asked for
     more = "; ".join(f"{name}: {text}" for name, text in (("likely", error.likely), ("try", error.hint)) if text)
     return f"{needs}{error.what} ({more})" if more else needs + error.what
+
+
+def not_measured(when: str, error: BaseException) -> IdentificationError:
+    """Return why something was not measured that the end of a run left out."""
+    what = getattr(error, "what", "interrupted")
+    return IdentificationError(
+        "E_NOT_MEASURED", f"the run ended {when}: {what}", hint="remove the cause, identify again"
+    )
 
 
 def blocking(refused: Mapping[str, str], *, given: bool) -> list[str]:

@@ -12,7 +12,7 @@ What the traces say is decided in ``identification/by_pulses``.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from pmsmtool.cia402 import HOMING_LOST, LEAST_LINK_V
@@ -24,7 +24,7 @@ from pmsmtool.drive.motion_objects import allowed, held_current_limits, rated_ap
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive, TorqueCurrent
 from pmsmtool.drive.torque_drives import SpeedPushDrive, TorqueDrive, pushing_drive
 from pmsmtool.drive_maps.drive_map import DriveMap
-from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, SdoAbort
+from pmsmtool.errors import ConfigError, IdentificationError, NotAvailable, PmsmtoolError, SdoAbort
 from pmsmtool.estimators.encoder import estimate_encoder
 from pmsmtool.experiments.current_limit import LimitShown, require_limit, show_torque_limit, unproven
 from pmsmtool.experiments.mechanics_run import ShaftAnswer
@@ -317,11 +317,25 @@ def measure_recorded(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Pu
 
 
 def measure_polled(task: Task, envelope: Envelope, keep: Keep, say: Say) -> PulseFacts:
-    """Turn the vector where the drive takes an angle, then push by torque where the pole pairs are then known."""
+    """Turn the vector where the drive takes an angle, then push by torque where the pole pairs are then known.
+
+    Where something ends the run, the facts of what was measured before are kept for its evaluation.
+    """
+    names: dict[str, None] = {}
+    try:
+        return _facts(task, _measure_polled(task, envelope, _noting(names, keep), say, names), names)
+    except (IdentificationError, NotAvailable):
+        raise
+    except PmsmtoolError as error:
+        if names:
+            facts = PulseFacts(Method.STANDARD, pole_pairs=_given_pole_pairs(task), no_push=why_no_push(error))
+            task.run.save(FACTS, dump_facts(_facts(task, facts, names)))
+        raise
+
+
+def _measure_polled(task: Task, envelope: Envelope, keep: Keep, say: Say, names: Mapping[str, None]) -> PulseFacts:
     drive, found = task.drive, task.found
     assert isinstance(drive, StandardDrive)
-    names: dict[str, None] = {}
-    keep = _noting(names, keep)
     facts = PulseFacts(Method.STANDARD, pole_pairs=_given_pole_pairs(task))
     asked = set(task.request.quantities)
     turns = bool(asked & {"poles", "encoder"}) and found.row("poles", Method.STANDARD).available
@@ -350,7 +364,7 @@ def measure_polled(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Puls
         finally:
             drive.may_be_energised = drive.may_be_energised or pushing.may_be_energised
             pushing.close()
-    return _facts(task, facts, names)
+    return facts
 
 
 def evaluate(task: Task, facts: PulseFacts) -> Stage:

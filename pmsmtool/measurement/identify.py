@@ -10,6 +10,7 @@ The drive's own identification, then the pulses of its capability level: one sta
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,15 +18,27 @@ from typing import Any
 from pmsmtool.bus.connection import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope
+from pmsmtool.drive.guard import RESTORED as OFF_AND_RESTORED
 from pmsmtool.drive.recorder_drives import MappedRecorderDrive, RecordingDrive
 from pmsmtool.drive.standard_drive import RecorderDrive, StandardDrive
 from pmsmtool.drive.torque_drives import ParameterDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
-from pmsmtool.errors import DriveFault, IdentificationError, NotAvailable, PmsmtoolError, SafetyRefusal
+from pmsmtool.errors import IdentificationError, Interrupted, NotAvailable, PmsmtoolError, StopNotConfirmed
 from pmsmtool.experiments.standstill import ReadSupply
+from pmsmtool.files import make_folder
 from pmsmtool.flash.map_gate import check_motion
+from pmsmtool.identification.by_pulses import FACTS, read_facts
 from pmsmtool.identification.by_vendor import SOURCE
-from pmsmtool.identification.request import MACHINE, REQUEST, IdentifyRequest, Method, dump_request
+from pmsmtool.identification.request import (
+    MACHINE,
+    PREDICTED,
+    REFUSED,
+    REQUEST,
+    IdentifyRequest,
+    Method,
+    dump_request,
+    trace_files,
+)
 from pmsmtool.identification.value_verdict import with_left_out
 from pmsmtool.identification.verdicts import KEYS
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
@@ -56,21 +69,22 @@ class Row:
     """Runs the experiments; returns what the evaluation needs besides the stored traces."""
     evaluate: Callable[[Task, Any], Stage]
     """Evaluates what is stored in the run, and writes the machine file."""
-    begun: Any = None
-    """What to evaluate with where the experiments end early; None: nothing is."""
+    begun: Callable[[RunDirectory], Any] = lambda run: None
+    """Returns what to evaluate with where something ended the experiments; None: nothing is evaluated."""
 
 
 METHODS: Mapping[Method, Row] = {
     Method.INJECT: Row(
         lambda found: CanopenDrive if "averages" in found.features or found.unsafe else RecordingDrive,
-        by_injection.plan, by_injection.measure, by_injection.evaluate, begun=(),
+        by_injection.plan, by_injection.measure, by_injection.evaluate, begun=lambda run: (),
     ),
     Method.RECORDER: Row(
         lambda found: RecorderDrive if found.drive_map.staging else MappedRecorderDrive,
         by_pulses.plan_recorded, by_pulses.measure_recorded, by_pulses.evaluate,
     ),
     Method.STANDARD: Row(
-        lambda found: StandardDrive, by_pulses.plan_polled, by_pulses.measure_polled, by_pulses.evaluate
+        lambda found: StandardDrive, by_pulses.plan_polled, by_pulses.measure_polled, by_pulses.evaluate,
+        begun=read_facts,
     ),
     Method.VENDOR: Row(lambda found: VendorDrive, by_vendor.plan, by_vendor.measure, by_vendor.evaluate),
 }  # fmt: skip
@@ -146,6 +160,7 @@ def identify(
         task = Task(run, own, found, request, known, read_supply)
         envelope, lines = row.plan(task)
         allow_motion([*envelope.lines(), *lines, RESTORED])
+        _set_aside(run)
         run.save(REQUEST, dump_request(request))
         clock = own.node.connection.clock
         start = clock.now()
@@ -153,17 +168,41 @@ def identify(
         def keep(name: str, trace: Trace) -> None:
             run.save(f"traces/{name}.npz", trace_npz(trace))
 
+        experiment = ""
+
+        def told(line: str) -> None:
+            nonlocal experiment
+            if not line.startswith((" ", OFF_AND_RESTORED)):
+                experiment = line
+            say(line)
+
         try:
-            facts = row.measure(task, envelope, keep, say)
-        except (DriveFault, IdentificationError, SafetyRefusal) as error:
-            if row.begun is not None:
-                # what was measured before is not lost: it is evaluated and recorded, and the run ends as it did
-                with contextlib.suppress(PmsmtoolError):
-                    kept = with_left_out(row.evaluate(task, row.begun), request)
+            facts = row.measure(task, envelope, keep, told)
+        except (NotAvailable, StopNotConfirmed):  # the next way is tried; nothing keeps a person from the hardware stop
+            raise
+        except PmsmtoolError as error:
+            if experiment and not isinstance(error, (IdentificationError, Interrupted)):
+                error.where = f'{error.where}, during "{experiment}"'.removeprefix(", ")
+            with contextlib.suppress(Exception):  # what ended the run outranks what cannot be evaluated
+                if (facts := row.begun(run)) is not None:
+                    # what was measured before is not lost: it is evaluated and recorded, and the run ends as it did
+                    kept = with_left_out(row.evaluate(task, facts), request)
                     run.add(replace(kept, status=status_of(error), note=text_of(error), seconds=clock.now() - start))
             raise
         seconds = clock.now() - start
     return replace(with_left_out(row.evaluate(task, facts), request), seconds=seconds)
+
+
+def _set_aside(run: RunDirectory) -> None:
+    """Move what an attempt that was ended left into a folder of its own: nothing of it is evaluated with the next."""
+    left = [*trace_files(run), *(path for path in [run.path / REFUSED] if path.is_file())]
+    if not left:
+        return
+    left += [path for name in (PREDICTED, FACTS, MACHINE) if (path := run.path / name).is_file()]
+    folder = next(there for k in itertools.count(1) if not (there := run.path / f"ended-{k}").exists())
+    make_folder(folder / "traces", hint="check your rights there and the space on the disk")
+    for path in left:
+        path.rename(folder / path.relative_to(run.path))
 
 
 @contextlib.contextmanager
@@ -206,6 +245,12 @@ def identify_after_drive(
         rest = identify(run, drive, request, allow_motion, say, method=Method.STANDARD, found=found, known=completed)
     except NotAvailable as lacking:
         return replace(own, fallbacks=(*own.fallbacks, *lacking.what.splitlines()))
+    except PmsmtoolError as error:  # the drive's own values are not lost
+        kept = run.read().stage("identify")
+        if kept is not None and kept.note == text_of(error):
+            own = _joined(run, own, kept, known)
+        run.add(replace(own, status=status_of(error), note=text_of(error)))
+        raise
     return _joined(run, own, rest, known)
 
 

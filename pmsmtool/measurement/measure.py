@@ -47,6 +47,7 @@ from pmsmtool.identification.phase_check import PhaseCheck, check_pairs, check_p
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
 from pmsmtool.identification.request import LEFT_OUT, entry, steps_of
 from pmsmtool.identification.value_verdict import BEND_NOTED
+from pmsmtool.identification.verdicts import ENDED, not_measured
 from pmsmtool.identification.wiring import supply_power
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import flux_map, frequency_response, mechanics
@@ -122,7 +123,7 @@ class Measurement:
     keep: Callable[[str, Trace], None]
     """Stores a trace under its name as soon as it is there."""
     say: Callable[[str], None]
-    """Told one line per experiment."""
+    """Told one line per experiment; what belongs to it follows indented."""
     ripple_share: float = RIPPLE_SHARE
     """Ripple of the injection, peak to peak, of the rated current."""
     held: bool = False
@@ -150,8 +151,18 @@ class Measurement:
     def run(self, quantities: tuple[str, ...]) -> None:
         """Run what the quantities need; what is refused (:attr:`refused`) takes along only what depends on it.
 
-        Raises IdentificationError: noise, phases, encoder counts or current sensors: nothing more is moved.
+        Raises IdentificationError: noise, phases, encoder counts or current sensors: nothing more is moved;
+        PmsmtoolError: what else ended the run; :attr:`refused` says so of what was not reached.
         """
+        try:
+            self._run(quantities)
+        except IdentificationError:
+            raise
+        except (PmsmtoolError, KeyboardInterrupt) as error:
+            self.refused[ENDED] = not_measured("before it", error)
+            raise
+
+    def _run(self, quantities: tuple[str, ...]) -> None:
         steps = steps_of(quantities, self.held)
         if self.drive.read(COMPENSATION) != 0.0:
             self.drive.write({COMPENSATION: 0.0})  # of an earlier commissioning: the inverter's own error is asked for
@@ -287,10 +298,8 @@ class Measurement:
             self.drive.disable()
             self.drive.enable()
             return None
-        except PmsmtoolError as error:  # it ends the run; the traces of this experiment are not whole
-            self.refused[quantity] = IdentificationError(
-                "E_NOT_MEASURED", f"the run ended during it: {error.what}", hint="remove the cause, identify again"
-            )
+        except (PmsmtoolError, KeyboardInterrupt) as error:  # the traces of this experiment are not whole
+            self.refused[quantity] = not_measured("during it", error)
             raise
 
     def _shaft(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult, steps: set[str]) -> None:
@@ -310,7 +319,7 @@ class Measurement:
 
             def planned() -> None:
                 if forecast is not None:
-                    self.say(mechanics.mechanics_line(values))
+                    self.say(f"  {mechanics.mechanics_line(values)}")
                     self._tell(entry("mechanics", values, rough=forecast.rough))
 
             self._attempt(
@@ -329,7 +338,7 @@ class Measurement:
             def sequence(plan: FrequencyPlan) -> None:
                 if forecast is not None:
                     found = self._computed(lambda: forecast.response(plan, self.drive.period_s))
-                    self.say(mechanics.response_line(found))
+                    self.say(f"  {mechanics.response_line(found)}")
                     at = {f"response_{hz:g}_hz": found.at(hz) for hz in mechanics.AT_HZ}
                     values = {"J_kgm2": found.J, **at}
                     self._tell(entry("frequency response", values, coherent_to_hz=found.highest_hz))
@@ -358,7 +367,7 @@ class Measurement:
         try:
             return forecast_of(self.drive, self._kept, noise, resistance, encoder, self._tolerance())
         except IdentificationError as error:
-            self.say(mechanics.not_predicted(error))
+            self.say(f"  {mechanics.not_predicted(error)}")
             self._tell(entry("mechanics", {}, reason=str(error)))
             return None
 
@@ -406,10 +415,10 @@ class Measurement:
 
         self._effort = effort_for(self.accuracy, predicted)
         values = predicted(self._effort).values(steps)
-        self.say(line_of(values))
+        self.say(f"  {line_of(values)}")
         later = mechanics.later_line(steps)
         if later:
-            self.say(later)
+            self.say(f"  {later}")
         self._tell(entry("levels", values, later=[what for step, what in mechanics.LATER.items() if step in steps]))
         self._leave_out(self._effort)
         check_prediction(values)

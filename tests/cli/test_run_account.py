@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 from pmsmtool.bus.clock import VirtualClock
-from pmsmtool.errors import StopNotConfirmed
+from pmsmtool.errors import LimitExceeded, StopNotConfirmed
 from pmsmtool.measurement import identify
 from pmsmtool.measurement.run_account import RunAccount, account_lines
-from pmsmtool.run_directory import RunDirectory
+from pmsmtool.run_directory import RunDirectory, Stage
 from tests.cli.conftest import Tool
 
 IDENTIFY = ("-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:", "--yes", "identify", "R")
@@ -94,6 +94,23 @@ def test_a_refused_run_names_its_refusal(tool: Tool) -> None:
     assert any("refused during identify" in line and "exit code 5" in line for line in data["ended"])
     assert any("no stop and no restore was reported" in line for line in data["ended"])
     assert "refused during identify" in page
+
+
+def test_what_was_measured_before_a_limit_is_data(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing came out on standard output, and the values were in the run alone."""
+
+    def stage(run: RunDirectory, *asked: object, **more: object) -> None:
+        error = LimitExceeded("current", 9.0, 7.5, "A", where="node 1")
+        value = {"name": "pole_pairs", "value": 3.0, "unit": "1", "source": "pmsmtool"}
+        run.add(Stage("identify", "refused", 1.0, values=[value], note=str(error), refused={"L": "not measured"}))
+        raise error
+
+    monkeypatch.setattr(identify, "identify", stage)
+    code, out, err = tool(*IDENTIFY, "--json")
+    shown = json.loads(out)
+    assert code == 5 and shown["status"] == "refused" and shown["refused"] == {"L": "not measured"}
+    assert [value["value"] for value in shown["values"]] == [3.0]
+    assert err.count("is outside the limit") == 1 and len(only_run().read().stages) == 1
 
 
 @pytest.mark.parametrize(

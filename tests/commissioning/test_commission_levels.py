@@ -31,7 +31,7 @@ from pmsmtool.drive.drive_node import DriveNode, is_safe
 from pmsmtool.drive.parameters import DriveParameters
 from pmsmtool.drive_maps.drive_map import DriveMap, reference_map
 from pmsmtool.drive_maps.shipped_maps import family_names, load_family
-from pmsmtool.errors import ConfigError, Contradiction, ExitCode, IdentificationError, NotAvailable
+from pmsmtool.errors import ConfigError, Contradiction, ExitCode, IdentificationError, LimitExceeded, NotAvailable
 from pmsmtool.files import data_folder
 from pmsmtool.identification.replay import replay
 from pmsmtool.identification.request import REPLAYED, IdentifyRequest
@@ -421,6 +421,20 @@ def test_a_measured_contradiction_says_what_to_change_also_where_no_push_succeed
     stage = RunDirectory(run).read().stage("identify")
     assert stage is not None and list(stage.refused) == ["psi", "mechanics"]
     assert all("the shaft does not answer (likely it is held)" in why for why in stage.refused.values())
+
+
+def test_a_limit_in_the_pulses_leaves_what_was_measured_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its own record, without values, stood in place of that of the identification."""
+    monkeypatch.chdir(tmp_path)
+    exceeded = LimitExceeded("current", 9.0, 7.5, "A", where="node 1")
+    monkeypatch.setattr(by_pulses, "push_by_torque", Mock(side_effect=exceeded))
+    bus = ["-i", "pmsmsim", "-c", "interior-2k2?nv=:memory:&drive=cia402"]
+    outcome = CliRunner().invoke(cli, [*bus, "commission", str(PROFILE), "--yes", "--json"])
+    assert isinstance(outcome.exception, LimitExceeded) and 'during "pole pairs' in outcome.exception.where
+    shown = json.loads(outcome.stdout)
+    assert "pole_pairs" in {value["name"] for value in shown["values"]} and len(shown["stages"]) == 1
+    assert "current 9 A is outside the limit 7.5 A" in shown["stages"][0]["refused"]["mechanics"]
+    assert "measured: pole_pairs 3" in outcome.stderr
 
 
 def test_a_map_with_every_gain_says_what_a_proof_lacks_besides(tmp_path: Path) -> None:

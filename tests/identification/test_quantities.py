@@ -10,15 +10,16 @@ import pytest
 from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
-from pmsmtool.errors import DriveFault, IdentificationError
+from pmsmtool.errors import DriveFault, IdentificationError, LimitExceeded
 from pmsmtool.identification.replay import replay
-from pmsmtool.identification.request import MACHINE, REFUSED, IdentifyRequest, refused_in
+from pmsmtool.identification.request import MACHINE, PREDICTED, REFUSED, IdentifyRequest, refused_in
 from pmsmtool.identification.verdicts import DESIGNED_FROM, ESSENTIAL, STEP, blocking, verdicts_of
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.machine.parameters import MachineParameters
 from pmsmtool.measurement import mechanics
 from pmsmtool.measurement.by_injection import nameplate_of
 from pmsmtool.measurement.identify import identify
+from pmsmtool.measurement.measure import Measurement
 from pmsmtool.measurement.square_waves import SquareStage
 from pmsmtool.refusals import refuse
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage, new_record
@@ -27,8 +28,10 @@ from pmsmtool.sim.bus import PmsmSimBus
 CHANNEL = "interior-2k2?nv=:memory:"
 
 
-def identified(folder: Path, quantities: tuple[str, ...]) -> tuple[RunDirectory, Stage, MachineParameters]:
-    run = RunDirectory.create(folder, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
+def identified(
+    folder: Path, quantities: tuple[str, ...], run: RunDirectory | None = None
+) -> tuple[RunDirectory, Stage, MachineParameters]:
+    run = run or RunDirectory.create(folder, 1, new_record(["test"], drive={}, bus={}, versions={}, operator="nobody"))
     with Connection(PmsmSimBus(CHANNEL)) as connection:
         drive = CanopenDrive(connection, 1)
         nameplate = nameplate_of(drive, "bench")
@@ -88,6 +91,36 @@ def test_a_fault_ends_the_run_and_what_was_measured_before_is_kept(
     monkeypatch.undo()
     assert set(replay(run).refused) == {"L"}
     assert load_machine_file(run.path / MACHINE).machine.R_s_ohm == pytest.approx(3.6, rel=0.01)
+
+
+@pytest.mark.chain
+def test_a_limit_that_ended_a_run_names_its_experiment_and_hinders_no_later_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A resumed run refused what it had just measured: the refusal of the ended one lay beside its traces."""
+
+    def exceeded(*_: object) -> None:
+        raise LimitExceeded("current", 9.0, 7.5, "A", where="node 1")
+
+    monkeypatch.setattr(Measurement, "_levels", exceeded)
+    with pytest.raises(LimitExceeded) as caught:
+        identified(tmp_path, ("R", "poles"))
+    assert caught.value.where.startswith('node 1, during "phases: three vectors of')
+    (folder,) = tmp_path.iterdir()
+    run = RunDirectory(folder)
+    (stage,) = run.read().stages
+    assert stage.status == "refused" and not stage.values
+    assert stage.refused == {
+        "R": "E_NOT_MEASURED: the run ended during it: current 9 A is outside the limit 7.5 A (try: remove the cause, "
+        "identify again)",
+        "poles": "E_NOT_MEASURED: the run ended before it: current 9 A is outside the limit 7.5 A (try: remove the "
+        "cause, identify again)",
+    }
+    assert replay(run).refused == stage.refused
+    monkeypatch.undo()
+    _, stage, _ = identified(tmp_path, ("R",), run)
+    assert stage.status == "pass" and not (folder / REFUSED).exists()
+    assert {path.name for path in (folder / "ended-1").iterdir()} == {"traces", REFUSED, PREDICTED}
 
 
 @pytest.mark.chain

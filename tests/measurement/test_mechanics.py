@@ -96,7 +96,7 @@ def test_the_inertia_is_right_where_i_d_does_not_stay_zero(tmp_path: Path, monke
         assert error < limit * settings.number(key), key
         assert error < 2.0 * statistical_half_width(found[key]), key
     pushes = said.index(next(line for line in said if line.startswith("J, B, tau_c: torque pulses")))
-    assert said[pushes + 1].startswith("predicted standard deviation: J ")
+    assert said[pushes + 1].startswith("  predicted standard deviation: J ")
     assert computed_off == [True], "a slow computer sends no heartbeat meanwhile, and the drive would trip"
     first, last = predictions
     assert first["later"] == ["J, B, tau_c"] and last["before"] == "mechanics"

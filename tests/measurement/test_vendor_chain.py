@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -19,9 +20,10 @@ from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.vendor_tuning import VendorDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.drive_maps.shipped_maps import load_family
-from pmsmtool.errors import Contradiction
+from pmsmtool.errors import Contradiction, LimitExceeded
 from pmsmtool.identification.request import IdentifyRequest
 from pmsmtool.machine.machine_file import load_machine_file
+from pmsmtool.measurement import by_pulses
 from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, examine
 from pmsmtool.measurement.identify import open_for_level
 from pmsmtool.proof.stage import ProofRequest
@@ -115,6 +117,19 @@ def test_measured_values_outrank_the_drives_own(tmp_path: Path) -> None:
     assert machine.machine.J_kgm2 == pytest.approx(TRUTH.J_kgm2, rel=0.16), "0x6075 may be peak or rms"
     assert machine.estimates["psi_f_wb"].source == "pmsmtool" and machine.estimates["R_s_ohm"].source == "vendor"
     assert "vendor: R_s_ohm, pole_pairs; as given: L_d_h, L_q_h" in str(machine.provenance["source"])
+
+
+def test_a_limit_that_ends_the_pulses_does_not_take_the_drives_own_values_along(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exceeded = LimitExceeded("speed", 520.0, 500.0, "rpm")
+    monkeypatch.setattr(by_pulses, "push_by_torque", Mock(side_effect=exceeded))
+    with pytest.raises(LimitExceeded):
+        first_stage(tmp_path, load_family("synapticon"))
+    (folder,) = (tmp_path / "runs").iterdir()
+    (*_, stage) = RunDirectory(folder).read().stages
+    assert stage.status == "refused" and "speed 520 rpm is outside" in stage.note
+    assert {"R_s_ohm", "pole_pairs", "psi_f_wb"} <= {value["name"] for value in stage.values}
 
 
 def test_a_drive_set_to_other_pole_pairs_is_not_pushed(tmp_path: Path) -> None:
