@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pmsmtool.arrays import Array
 from pmsmtool.design.prediction import Band, Fault, Prediction, Quantity
 from pmsmtool.errors import ConfigError, next_step
+from pmsmtool.proof.plan import SPEED, TURN_ORDERS
 from pmsmtool.trace import Trace
 
 NEXT_STEP = "prove again: the prediction beside the traces was damaged"
@@ -103,6 +104,8 @@ SHAKES = (
     "the machine shakes in steady state by more than the band: an encoder off centre behind a stiff speed loop, an "
     "elastic shaft, cogging, or a link with ripple"
 )
+TOLD_APART = 0.05
+"""Least mean square by which patterns differ in a wave over the angle that is taken out of them; most is 0.5."""
 RIPPLE_SIGMAS = 3.0
 """Largest of some hundred averages, in their standard deviations."""
 LEAST_STEADY_ROWS = 16
@@ -145,13 +148,13 @@ def with_ripple(prediction: Prediction, traces: Mapping[str, Trace]) -> Predicti
 
     Cogging, harmonics of the back-EMF, an encoder off centre and the ripple of the link shake a healthy machine; at
     what angle is not known before. Of a steady end it is the largest deviation from a straight line; of a pattern
-    that was repeated, what an average over the repeats still holds of what they differ by.
+    that was repeated, what an average over the repeats still holds of what :func:`patterns` differ by.
     """
     bands = dict(prediction.bands)
     for (experiment, signal), band in prediction.bands.items():
         if experiment not in traces:
             continue
-        repeats = traces[experiment][signal].reshape(-1, len(band.mean))
+        repeats = patterns(traces[experiment], signal, len(band.mean))
         steady = prediction.facts.get("steady_rows", {}).get(experiment, 0)
         ripple = 0.0
         if len(repeats) > 1:
@@ -163,6 +166,26 @@ def with_ripple(prediction: Prediction, traces: Mapping[str, Trace]) -> Predicti
             band, ripple=min(ripple, _most_ripple(band)) if math.isfinite(ripple) else 0.0
         )
     return replace(prediction, bands=bands)
+
+
+def patterns(trace: Trace, signal: str, rows: int) -> Array:
+    """Return the repeated patterns of a record, shape (repeats, rows), without what turns with the rotor.
+
+    Harmonics of the back-EMF, dead times, offsets and gains of the current sensors make waves over the electrical angle
+    (:data:`TURN_ORDERS`). Each pattern meets other angles, and the response is the same in all of them: least squares
+    on what they differ by. Averages of eight still held 0.4 of 0.85 A of a 7th of 1.4 %, which failed a healthy drive.
+    """
+    values = trace[signal].reshape(-1, rows)
+    angle = np.cumsum(trace[SPEED] * trace.period_s) if len(values) > 1 else np.array([math.nan])
+    if not math.isfinite(angle[-1]):
+        return values
+    turning = np.exp(1j * np.multiply.outer(angle, TURN_ORDERS))
+    waves = np.concatenate([turning.real, turning.imag], axis=1).reshape(len(values), rows, -1)
+    differing = (waves - waves.mean(axis=0)).reshape(values.size, -1)
+    power, modes = np.linalg.eigh(differing.T @ differing / values.size)
+    shown = power > TOLD_APART
+    along = modes[:, shown].T @ (differing.T @ values.ravel()) / values.size
+    return np.asarray(values - waves @ (modes[:, shown] @ (along / power[shown])))
 
 
 def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> Judgement:

@@ -30,7 +30,8 @@ from pmsmtool.params.catalogue import FIELD_WEAKENING_MODES
 from pmsmtool.proof.conditions import Conditions, room_k, warmth
 from pmsmtool.units import RAD_S_PER_RPM
 
-SIGNALS = ("i_d_a", "i_q_a", "omega_e_rad_s", "u_d_lim_v", "u_q_lim_v")
+SPEED = "omega_e_rad_s"
+SIGNALS = ("i_d_a", "i_q_a", SPEED, "u_d_lim_v", "u_q_lim_v")
 """What is recorded of every experiment but a move."""
 LINK, VOLTAGE_LIMITED = "U_dc_v", ("unreachable", "weakening")
 """Recorded beside them in experiments whose response the link decides."""

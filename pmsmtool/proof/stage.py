@@ -40,10 +40,10 @@ from pmsmtool.measurement.limits import within_supply
 from pmsmtool.npz_file import npz_bytes, read_npz
 from pmsmtool.proof.conditions import Conditions, conditions_of
 from pmsmtool.proof.drawn_machine import BENT, SEEN_SHARES, U_DC_SPREAD, bend_of
-from pmsmtool.proof.judgement import Judgement, from_arrays, judge, to_arrays, with_ripple
+from pmsmtool.proof.judgement import Judgement, from_arrays, judge, patterns, to_arrays, with_ripple
 from pmsmtool.proof.measured import SpeedNotReached, run_experiments
-from pmsmtool.proof.plan import LINK, Experiment, ProofPlan, plan_proof
-from pmsmtool.proof.simulated import RUNS, averaged, predict_proof
+from pmsmtool.proof.plan import LINK, SPEED, Experiment, ProofPlan, plan_proof
+from pmsmtool.proof.simulated import RUNS, predict_proof
 from pmsmtool.run_directory import Acceptance, RunDirectory, Stage
 from pmsmtool.trace import Trace, read_trace, trace_npz
 from pmsmtool.units import RAD_S_PER_RPM
@@ -61,7 +61,6 @@ RATED_SHARE = 1.12
 """Largest rated power that is proven, of that from which on the link gives way: 10 % less at rated power, as a supply
 gives it (1.11), stay above ``LINK_KEPT`` with 8 % of losses. Two healthy drives of 9.1 and 9.6 % were proven at 65 and
 63 % of their rated current."""
-SPEED = "omega_e_rad_s"
 AT_REST = 0.1
 """Predicted end of a speed, of its largest, below which the experiment ends at rest: a move."""
 _HASH_DIGITS = 12
@@ -97,6 +96,8 @@ class _Record:
     prediction: Prediction
     save: Callable[[str, bytes], None]
     conditions: Conditions
+    rated_v: float
+    """DC link of the machine file (V)."""
     measured: dict[tuple[str, str], Array] = field(default_factory=dict)
     done: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -105,7 +106,7 @@ class _Record:
         """Store a record and compare it, unless its link is not the predicted one; False when it is grossly outside."""
         self.save(f"{experiment.name}.npz", trace_npz(trace))
         self.done.append(experiment.name)
-        if apart := _link_apart(experiment, trace, self.conditions):
+        if apart := _link_apart(experiment, trace, self.conditions, self.rated_v):
             self.left_out.append(f"{experiment.text}: {apart}")
             return True
         self.measured |= responses({experiment.name: trace}, self.prediction)
@@ -115,13 +116,16 @@ class _Record:
         return max(shares) <= GROSS
 
 
-def _link_apart(experiment: Experiment, trace: Trace, conditions: Conditions) -> str:
-    """Return how far the link is from rest in a record that it decides; empty where it is as predicted, or failed."""
+def _link_apart(experiment: Experiment, trace: Trace, conditions: Conditions, rated_v: float) -> str:
+    """Return how far the link is from rest in a record that it decides; empty where it is as predicted, or failed.
+
+    A link behind a rectifier keeps what braking before the proof has charged it by: its first load brings it back.
+    """
     if LINK not in experiment.signals:
         return ""
     low, high = (float(v) for v in np.quantile(trace[LINK], (LOWEST_LINK, 1.0 - LOWEST_LINK)))
     rest, ripple_v = conditions.U_dc_v, SEEN_SHARES[1] * conditions.U_dc_ripple_v
-    if LINK_KEPT * rest <= low < rest * (1.0 - U_DC_SPREAD) - ripple_v:
+    if LINK_KEPT * min(rest, rated_v) <= low < rest * (1.0 - U_DC_SPREAD) - ripple_v:
         return f"not judged: under load the DC link falls from {rest:.4g} to {low:.4g} V, and it decides the response"
     if high > rest * (1.0 + U_DC_SPREAD) + ripple_v:
         return f"not judged: braking raised the DC link from {rest:.4g} to {high:.4g} V, and it decides the response"
@@ -198,7 +202,7 @@ def prove_stage(
     def save(name: str, data: bytes) -> None:
         run.save(f"{folder}/{name}", data)
 
-    record = _Record(prediction, save, conditions)
+    record = _Record(prediction, save, conditions, design.machine.inverter.U_dc_v)
     drive.recorder.forget()  # a download before this may have reset the drive
     event: PmsmtoolError | None = None
     try:
@@ -293,19 +297,18 @@ def band_lines(prediction: Prediction) -> list[str]:
 
 
 def responses(traces: Mapping[str, Trace], prediction: Prediction) -> dict[tuple[str, str], Array]:
-    """Return the judged responses of recorded experiments, repeated patterns averaged."""
+    """Return the judged responses of recorded experiments, repeated patterns averaged without what turns in them."""
     found = {}
     for (experiment, signal), band in prediction.bands.items():
         if experiment in traces:
             trace = traces[experiment]
             repeats = int(trace.meta.get("repeats", 1))
-            values = trace[signal]
-            if len(values) != repeats * len(band.mean):
+            if len(trace) != repeats * len(band.mean):
                 raise ConfigError(
-                    f"{experiment}: the record has {len(values)} rows of {repeats * len(band.mean)}",
+                    f"{experiment}: the record has {len(trace)} rows of {repeats * len(band.mean)}",
                     hint="prove the design again: the record is not of this prediction",
                 )
-            found[experiment, signal] = np.asarray(values.reshape(repeats, -1).mean(axis=0))
+            found[experiment, signal] = np.asarray(patterns(trace, signal, len(band.mean)).mean(axis=0))
     return found
 
 
@@ -389,4 +392,4 @@ def not_proven(stage: Stage, run: RunDirectory) -> PmsmtoolError:
     )  # fmt: skip
 
 
-__all__ = ["ProofRequest", "averaged", "envelope_of", "not_proven", "prove_stage", "read_proof", "responses"]
+__all__ = ["ProofRequest", "envelope_of", "not_proven", "prove_stage", "read_proof", "responses"]

@@ -12,7 +12,7 @@ import pytest
 from pmsmtool.design.prediction import LEAST_FACTOR, Direction, Prediction, predict
 from pmsmtool.errors import ConfigError
 from pmsmtool.npz_file import npz_bytes
-from pmsmtool.proof.judgement import SHAKES, from_arrays, judge, to_arrays, with_ripple
+from pmsmtool.proof.judgement import SHAKES, from_arrays, judge, patterns, to_arrays, with_ripple
 from pmsmtool.trace import Trace
 
 ROWS = 120
@@ -156,8 +156,9 @@ def steady(found: Prediction) -> Prediction:
     return replace(found, facts={**found.facts, "steady_rows": {"step": 40}})
 
 
-def recorded(values: np.ndarray) -> dict[str, Trace]:  # type: ignore[type-arg]
-    return {"step": Trace(1e-4 * np.arange(values.size), {"i_q_a": values}, {"i_q_a": "A"})}
+def recorded(values: np.ndarray, omega_e: float = 0.0) -> dict[str, Trace]:  # type: ignore[type-arg]
+    signals = {"i_q_a": values, "omega_e_rad_s": np.full(values.size, omega_e)}
+    return {"step": Trace(1e-4 * np.arange(values.size), signals, {"i_q_a": "A", "omega_e_rad_s": "rad/s"})}
 
 
 def half(found: Prediction) -> float:
@@ -192,6 +193,30 @@ def test_of_a_repeated_pattern_the_ripple_is_what_its_average_holds() -> None:
     wider = with_ripple(found, recorded(shaken))
     assert wider.bands[KEY].ripple == pytest.approx(3.0 * 0.01 / math.sqrt(8.0), rel=0.1)
     assert np.max(np.abs(shaken.reshape(8, -1).mean(axis=0) - found.bands[KEY].mean)) < 1.3 * wider.bands[KEY].ripple
+
+
+@pytest.mark.parametrize("order", [1, 2, 6, 12])
+def test_what_turns_with_the_rotor_is_in_no_repeated_pattern(order: int) -> None:
+    found, turns = prediction(), 1.0 + 0.9 / order
+    omega_e = 2.0 * math.pi * turns / (ROWS * 1e-4)
+    angle = omega_e * 1e-4 * np.arange(1, 8 * ROWS + 1)
+    for gain, inside in ((1.0, True), (1.25, False)):
+        response = np.mean(responses(400, 3, gain=gain), axis=0)
+        alone = judge(found, {KEY: response}).seen[0].share
+        shaken = np.tile(response, 8) + 6.0 * half(found) * np.cos(order * angle + 1.0)
+        assert not judge(found, {KEY: shaken.reshape(8, -1).mean(axis=0)}).inside
+        record = recorded(shaken, omega_e)
+        measured = {KEY: patterns(record["step"], "i_q_a", ROWS).mean(axis=0)}
+        wider = with_ripple(found, record)
+        assert wider.bands[KEY].ripple < 1e-6 * half(found)
+        assert judge(wider, measured).inside == inside
+        assert judge(wider, measured).seen[0].share == pytest.approx(alone, rel=1e-6)
+
+
+@pytest.mark.parametrize(("repeats", "omega_e"), [(8, 0.0), (8, 2e-3), (1, 500.0), (8, math.nan)])
+def test_patterns_at_equal_angles_stay_as_they_are(repeats: int, omega_e: float) -> None:
+    values = np.random.default_rng(0).standard_normal((repeats, ROWS))
+    assert np.array_equal(patterns(recorded(values.ravel(), omega_e)["step"], "i_q_a", ROWS), values)
 
 
 def test_another_length_is_refused() -> None:

@@ -48,6 +48,7 @@ from pmsmtool.proof.judgement import judge, with_ripple
 from pmsmtool.proof.stage import (
     ProofRequest,
     _beyond,
+    _link_apart,
     _too_slow,
     envelope_of,
     prove_stage,
@@ -58,6 +59,7 @@ from pmsmtool.proof.stage import (
 )
 from pmsmtool.run_directory import RECORD, RunDirectory, Stage
 from pmsmtool.sim.kernel import Params
+from pmsmtool.trace import Trace
 from pmsmtool.units import RAD_S_PER_RPM
 
 pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
@@ -245,7 +247,7 @@ def test_a_link_below_what_it_showed_at_rest_is_named(design: Design, monkeypatc
         return replace(found, U_dc_v=found.U_dc_v / 0.85)
 
     monkeypatch.setattr(stages, "conditions_of", at_rest)
-    with flashed(design) as drive:
+    with flashed(design, truth=replace(machine(), simulation={"U_dc_v": 0.85 * 540.0})) as drive:
         _, stage = prove(drive, design, asked=replace(FEW, experiments=("unreachable",)))
     assert stage.status == "fail" and "likely the voltage is too low" in stage.note
 
@@ -274,6 +276,15 @@ def test_what_a_link_that_braking_raised_decides_is_not_judged(design: Design, m
     assert [line for line in stage.fallbacks if "not judged: braking raised the DC link from 500 to 540 V" in line]
     assert {line.what.partition(":")[0] for line in stage.acceptance} >= {"q_steps"}
     assert not [line for line in stage.acceptance if line.what.startswith("unreachable")]
+
+
+def test_a_link_that_braking_has_charged_before_may_fall_to_what_is_rated() -> None:
+    """A stranger's rectifier of 560 V showed 633 V before its proof: unreachable i_d came to 194 % of the band."""
+    experiment: Any = SimpleNamespace(signals=("U_dc_v",))
+    for rest_v, low_v, told in (633, 540, True), (633, 480, False), (560, 480, False), (500, 440, True):
+        trace = Trace(1e-4 * np.arange(40), {"U_dc_v": np.full(40, low_v)}, {"U_dc_v": "V"})
+        apart = _link_apart(experiment, trace, Conditions(rest_v, 25.0, 25.0, 0, 1.0, 1.0), 560.0)
+        assert (f"falls from {rest_v} to {low_v} V" in apart) == told
 
 
 def test_a_supply_that_gives_way_bounds_the_power_of_a_proof(design: Design) -> None:
