@@ -93,7 +93,10 @@ def test_ctrl_c_at_any_moment_leaves_a_drive_that_is_off_and_as_before(
         assert not drive.may_be_energised
         assert state_of(drive) == before
         drive.close()
-    assert not list(tmp_path.glob("*/machine.toml"))
+    (folder,) = tmp_path.iterdir()
+    stages = RunDirectory(folder).read().stages  # what was measured before is kept, and never passes for the whole
+    assert all(stage.status == "interrupted" and "mechanics" in stage.refused for stage in stages)
+    assert (folder / "machine.toml").is_file() is any(stage.values for stage in stages)
 
 
 def test_a_speed_limit_that_tells_nothing_is_refused_before_anybody_is_asked(tmp_path: Path) -> None:
