@@ -161,7 +161,8 @@ class Dictionary:
 
         Raises ConfigError: there is no such object.
         """
-        hidden = [key for key in self._entries if key >> 8 == index and sub in (None, key & 0xFF)]
+        own = range(index << 8, index + 1 << 8)
+        hidden = [key for key in (own if sub is None else own[sub : sub + 1]) if key in self._entries]
         if not hidden and index not in self._hidden:
             raise ConfigError(
                 f"the drive has no object 0x{index:04X}" + ("" if sub is None else f":{sub:02X}"),
@@ -171,7 +172,8 @@ class Dictionary:
         for key in hidden:
             del self._entries[key]
         self._hidden.add(index)
-        self._indices = {key >> 8 for key in self._entries}
+        if not any(key in self._entries for key in own):
+            self._indices.discard(index)
 
     def show(self, entry: Entry) -> None:
         """Answer with this entry at its object from now on; the application still finds its own by key."""
