@@ -36,9 +36,11 @@ from pmsmtool.estimators.estimate import (
 from pmsmtool.estimators.least_squares import Fit, levenberg_marquardt
 from pmsmtool.estimators.shaft.response_lines import (
     HALF_WIDTH,
+    SHARE_LEAST,
     STAGE,
     counted,
     local_polynomials,
+    smooth_power,
     transforms,
     without_noise,
 )
@@ -78,6 +80,9 @@ ZETA_FLOOR = 0.01
 INERTIA_FLOOR = 1e-3
 """Relative deviation of the inertia beyond the fit's and the torque's (tests/measurement/test_frequency_response)."""
 INERTIA_FALLBACK = "from the frequency response alone: friction is not known, and a load behind a play is not seen"
+ACROSS_DOUBT = 0.5
+"""Part of what as much noise in i_q as i_d has would take off the response that is a deviation of the inertia: motors
+of a stranger's plant were 5.8, 1.0, 21 and 10 % off where it takes 8.2, 0.9, 69 and 61 %."""
 METHOD = "random torque at speed, maximum likelihood in the frequency domain"
 
 
@@ -179,8 +184,12 @@ def estimate_frequency_response(
     if flagged:
         raise refuse("E_CLIPPED", f"{flagged} samples of the run are limited or clipped", stage=STAGE)
     omega, of_currents, Y, T = transforms(runs, [torque(run["i_d_a"], run["i_q_a"]) for run in runs], direction)
+    per_a = torque(np.zeros(1), np.ones(1))
+    _, across, *_ = transforms(runs, [per_a * run["i_d_a"] for run in runs], direction)
+    white = (len(runs[0]) - 2) * noise_nm**2
+    noise = np.maximum(0.0, smooth_power(across) - white) / smooth_power(of_currents)
     _, cogging, *_ = transforms(runs, [over_angle(direction * run["theta_M_rad"]) for run in runs], direction)
-    U = without_noise(of_currents + cogging, (len(runs[0]) - 2) * noise_nm**2)
+    U = without_noise(of_currents + cogging, white)
     omega, Y = omega[: U.shape[1]], Y[:, : U.shape[1]]
     unsure = angle_std * np.sqrt(np.mean(np.abs(cogging[:, : U.shape[1]]) ** 2, axis=0))
     scale = (scale_std, tolerance or SensorTolerance())
@@ -188,13 +197,27 @@ def estimate_frequency_response(
     if result.information_gain > INFORMATION_GAIN and np.any(blind := counted(runs, omega)):
         beside, _, _ = _judged(omega, U, Y, T, np.where(blind, math.inf, unsure), scale)
         if beside.information_gain <= INFORMATION_GAIN:
-            return beside
+            return _doubted(beside, noise)
     if result.information_gain > INFORMATION_GAIN and not result.found:
         ripple = _ripple(lines, rigid, runs, direction, U.shape[1])
         if ripple is not None:
             steady, _, _ = _judged(omega, U + ripple, Y, T, unsure, scale)
-            return steady if steady.information_gain <= INFORMATION_GAIN else result
-    return result
+            result = steady if steady.information_gain <= INFORMATION_GAIN else result
+    return _doubted(result, noise)
+
+
+def _doubted(result: FrequencyResponse, noise: Array) -> FrequencyResponse:
+    """Return a response whose inertia has in its interval what noise of the torque may take off it.
+
+    ``noise`` is its share of each line. The steps are in i_q alone: what i_d has beside the noise of a sample at rest,
+    i_q may have as well, of currents that turn with the rotor or that flow between the rows. It is in no torque.
+    """
+    if result.inertia is None:
+        return result
+    weight = np.where(result.coherence >= COHERENT, (np.abs(result.response) / result.std) ** 2, 0.0)
+    taken = -np.log(np.maximum(SHARE_LEAST, 1.0 - noise[HALF_WIDTH:][: len(weight)]))
+    doubt = ACROSS_DOUBT * float(np.average(taken, weights=weight)) * result.inertia.value
+    return replace(result, inertia=replace(result.inertia, std=math.hypot(result.inertia.std, doubt)))
 
 
 def _judged(

@@ -73,6 +73,13 @@ def counted(runs: Sequence[Trace], omega: Array) -> NDArray[np.bool_]:
     return blind
 
 
+def smooth_power(U: Complex) -> Array:
+    """Return the mean squared magnitude of lines over records, and over as many lines as the polynomials use."""
+    mean = np.mean(np.abs(U) ** 2, axis=0)
+    around = np.ones(2 * HALF_WIDTH + 1)
+    return np.asarray(np.convolve(mean, around, "same") / np.convolve(np.ones_like(mean), around, "same"))
+
+
 def without_noise(U: Complex, power: float) -> Complex:
     """Return of measured lines what their noise lets expect of the true ones, up to the last that is no noise.
 
@@ -87,15 +94,12 @@ def without_noise(U: Complex, power: float) -> Complex:
     power : float
         Mean squared magnitude of a line's noise.
     """
-    mean = np.mean(np.abs(U) ** 2, axis=0)
-    around = np.ones(2 * HALF_WIDTH + 1)
-    smooth = np.convolve(mean, around, "same") / np.convolve(np.ones_like(mean), around, "same")
-    share = 1.0 - power / smooth
+    share = 1.0 - power / smooth_power(U)
     clear = np.flatnonzero(share >= SHARE_LEAST)
     if len(clear) < LINES_LEAST + 2 * HALF_WIDTH:
         raise refuse(
             "E_COHERENCE",
-            f"the torque is above the noise of its current on {len(clear)} of {len(mean)} lines, "
+            f"the torque is above the noise of its current on {len(clear)} of {len(share)} lines, "
             f"{LINES_LEAST + 2 * HALF_WIDTH} are needed",
             stage=STAGE,
         )
