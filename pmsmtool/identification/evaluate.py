@@ -59,7 +59,7 @@ from pmsmtool.identification.mechanics import (
 )
 from pmsmtool.identification.phase_check import PairCheck, check_pairs, check_phases, over_phases
 from pmsmtool.identification.sampling import resistance_as_sampled
-from pmsmtool.identification.wiring import Finding, supply_power, supply_under_load
+from pmsmtool.identification.wiring import Finding, link_at_rest, supply_power, supply_under_load
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import MAGNET_ALPHA_PER_K
 from pmsmtool.plain_text import counted
@@ -91,14 +91,14 @@ _Found = TypeVar("_Found")
 class Evaluation:
     """What the traces of a run say; None where an experiment was not run, or is in ``refused`` with its reason.
 
-    ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics``, ``frf``,
-    ``cogging`` and ``harmonics``. ``means`` are inertia and friction by mean accelerations, by their keys, where no
-    model explains the pushes, and ``encoder_errors`` those of the position once and twice per turn (rad);
-    ``swing_hz`` is where pushes swing the shaft and no linear response does (Hz), ``unseen_hz`` from where on a shaft
-    that is not rigid may swing unseen, and ``load_ratio`` of load to motor there (0: unknown).
-    ``encoder_noise_rad`` is the standard deviation of a position at rest, without what drifts (mechanical).
-    ``warming_k_per_a2s`` is what the winding's sensor rises by (:func:`warming`).
-    ``supply_w`` is the power from which on the DC link gives way (W).
+    ``refused`` has the keys ``R``, ``encoder``, ``L``, ``psi``, ``map``, ``mechanics``, ``frf``, ``cogging`` and
+    ``harmonics``. ``means`` are inertia and friction by mean accelerations, by their keys, where no model explains the
+    pushes, and ``encoder_errors`` those of the position once and twice per turn (rad); ``swing_hz`` is where pushes
+    swing the shaft and no linear response does (Hz), ``unseen_hz`` from where on a shaft that is not rigid may swing
+    unseen, and ``load_ratio`` of load to motor there (0: unknown). ``encoder_noise_rad`` is the standard deviation of a
+    position at rest, without what drifts (mechanical). ``warming_k_per_a2s`` is what the winding's sensor rises by
+    (:func:`warming`), ``supply_w`` the power from which on the DC link gives way (W), and ``U_dc_rest_v`` the link that
+    the drive showed before anything moved (V).
     """
 
     noise: Noise
@@ -109,6 +109,7 @@ class Evaluation:
     warming_k_per_a2s: float = 0.0
     supply: Finding | None = None
     supply_w: float = math.inf
+    U_dc_rest_v: float = math.nan
     encoder: EncoderResult | None = None
     inductance: InductanceResult | None = None
     flux: FluxResult | None = None
@@ -151,8 +152,7 @@ class Evaluation:
         """What second methods say: psi_f by q currents, and L_q, apparent, beside the incremental one."""
         found = []
         if self.flux is not None and self.flux.driven is not None:
-            common = self.flux.voltage_scale_std
-            first = self.flux.psi_f
+            common, first = self.flux.voltage_scale_std, self.flux.psi_f
             apart = self.flux.apart_wb * first.value / self.flux.psi_measured.value
             alone = replace(first, std=math.sqrt(max(0.0, first.std**2 - apart**2)))
             wider = total_half_width(first) > NOTABLY_WIDER * total_half_width(alone)
@@ -217,8 +217,7 @@ def _beside_speeds(inductance: InductanceResult, apparent: Estimate) -> Inductan
 def tolerance_on(tolerance: SensorTolerance, U_dc_v: float) -> SensorTolerance:
     """Return the tolerances with the DC link on which the thresholds of the bridge act (V)."""
     without = U_dc_v < MOSFET_LINK_V and tolerance.bridge_difference_v is None
-    threshold_v = 0.0 if without else tolerance.bridge_threshold_v
-    return replace(tolerance, U_dc_v=U_dc_v, bridge_threshold_v=threshold_v)
+    return replace(tolerance, U_dc_v=U_dc_v, bridge_threshold_v=0.0 if without else tolerance.bridge_threshold_v)
 
 
 def evaluate(
@@ -242,9 +241,9 @@ def evaluate(
     ----------
     traces : mapping of str to Trace
         As the run directory keeps them: ``zero_current``, ``phase_vectors``, ``first_turn``, ``levels``,
-        ``phase_pairs``, ``rotation_forward``, ``rotation_backward``, ``square_d_<half period>``,
-        ``square_q_<half period>``, ``angle_d_<k>``, ``angle_q_<k>``, ``speeds``, ``map_<k>``, ``speeds_after_map``,
-        ``inertia_<k>``, ``frf_<k>``, ``turns_<k>``, ``slow_<k>``.
+        ``phase_pairs``, ``rotation_forward``, ``rotation_backward``, ``square_d_<half period>``, ``square_q_<half
+        period>``, ``angle_d_<k>``, ``angle_q_<k>``, ``speeds``, ``map_<k>``, ``speeds_after_map``, ``inertia_<k>``,
+        ``frf_<k>``, ``turns_<k>``, ``slow_<k>``.
     period_s : float
         Control period (s).
     T_ref_c : float
@@ -266,11 +265,12 @@ def evaluate(
         raise ConfigError("the run has no zero-current trace", hint="run identify again")
     tolerance = tolerance_on(tolerance or SensorTolerance(), U_dc_v)
     copper = copper or Copper(T_ref_c)
+    shown_v = link_at_rest(traces["zero_current"])
     traces = calibrated_traces(traces, tolerance)
     noise = estimate_noise(traces["zero_current"])
     mismatch = estimate_mismatch(traces["phase_pairs"], noise) if "phase_pairs" in traces else None
     traces = with_equal_sensors(traces, mismatch)
-    result = Evaluation(noise, _encoder_noise(traces["zero_current"]), mismatch=mismatch)
+    result = Evaluation(noise, _encoder_noise(traces["zero_current"]), mismatch=mismatch, U_dc_rest_v=shown_v)
     if "phase_vectors" in traces:
         check_phases(traces["phase_vectors"], result.noise)
     if "first_turn" in traces:

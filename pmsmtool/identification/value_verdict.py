@@ -25,7 +25,7 @@ from pmsmtool.identification.evaluate import NOTABLY_WIDER, Evaluation, unseen_c
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
 from pmsmtool.identification.sampling import timing_warnings
 from pmsmtool.identification.verdicts import KEYS, NOT_ACCEPTED, STEP, Verdicts, verdicts_of
-from pmsmtool.identification.wiring import SUPPLY, WRONG
+from pmsmtool.identification.wiring import LINK_AT_REST, SUPPLY, WRONG
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.temperature import WARMING
@@ -209,6 +209,8 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
             conditions |= {f"eddy_{axis}_s": fit.eddy_s, f"eddy_{axis}_time_s": fit.eddy_tau_s}
     if math.isfinite(evaluation.supply_w):
         conditions[SUPPLY] = evaluation.supply_w
+    if math.isfinite(evaluation.U_dc_rest_v):
+        conditions[LINK_AT_REST] = evaluation.U_dc_rest_v
     if evaluation.shown is not None:
         conditions["shown_instant_s"] = evaluation.shown.value_s
     if evaluation.flux is not None and evaluation.flux.apart_wb and evaluation.resistance is not None:

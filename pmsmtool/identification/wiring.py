@@ -334,15 +334,20 @@ def judge_supply(U_rest_v: float, turn: Trace | None, U_stated_v: float | None) 
     return Finding("supply", OK, f"DC link {U_rest_v:.4g} V{stated}")
 
 
+def link_at_rest(at_rest: Trace) -> float:
+    """Return the mean of the DC link ``U_dc_v`` without a current (V); NaN where it was not recorded."""
+    return float(np.mean(at_rest["U_dc_v"])) if "U_dc_v" in at_rest.signals else math.nan
+
+
 def supply_under_load(at_rest: Trace, loaded: Trace) -> Finding | None:
     """Judge the DC link under a current against that without one; None where either was not recorded (``U_dc_v``)."""
     if "U_dc_v" not in at_rest.signals or "U_dc_v" not in loaded.signals:
         return None
-    return judge_supply(float(np.mean(at_rest["U_dc_v"])), loaded, None)
+    return judge_supply(link_at_rest(at_rest), loaded, None)
 
 
-SUPPLY = "supply_w"
-"""Condition of a machine file: the power from which on its DC link gives way."""
+SUPPLY, LINK_AT_REST = "supply_w", "U_dc_rest_v"
+"""Conditions of a machine file: the power from which on its DC link gives way, and the link before anything moved."""
 
 
 def supply_power(at_rest: Trace, loaded: Trace) -> tuple[float, float]:
@@ -357,7 +362,7 @@ def supply_power(at_rest: Trace, loaded: Trace) -> tuple[float, float]:
     if "U_dc_v" not in at_rest.signals or "U_dc_v" not in loaded.signals:
         return math.inf, 0.0
     largest = int(np.argmax(np.abs(loaded["i_d_a"])))
-    U_rest_v, U_v = float(np.mean(at_rest["U_dc_v"])), float(loaded["U_dc_v"][largest])
+    U_rest_v, U_v = link_at_rest(at_rest), float(loaded["U_dc_v"][largest])
     held_w = 1.5 * float(loaded["u_d_v"][largest] * loaded["i_d_a"][largest])
     fall = 1.0 - U_v / U_rest_v
     if fall < SAGS * SAGS or not held_w > 0.0:
