@@ -330,6 +330,7 @@ def test_families_by_identity() -> None:
     assert name(family_of(0xFB, 0x63220000)) == "epos2"
     assert name(family_of(REFERENCE_VENDOR, 1)) == "pmsmsim"
     assert family_of(0, 0) is None and family_of(0xFB, 1) is None
+    assert family_of(0xFB, 0x68500000) is load_family("epos4"), "every search read 11 files again, 7 ms each"
     with pytest.raises(ConfigError, match="did you mean epos4"):
         load_family("epos5")
 
