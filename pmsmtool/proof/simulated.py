@@ -208,8 +208,11 @@ class SimulatedDrives:
                 break
             lead += lost / max(LEAST_LEFT, 1.0 - lost / before if before else 1.0)
             before = lost
-            drive = self._start(row, experiment, defect, lead)
-            self._get_ready(drive, row, experiment, run_in)
+            faster = self._start(row, experiment, defect, lead)
+            self._get_ready(faster, row, experiment, run_in)
+            if faster.word(Part.TRIP).value:
+                break  # off, it would be no drive of this machine
+            drive = faster
         return drive
 
     def _move(self, row: int, experiment: Experiment, defect: Defect | None) -> Array:
@@ -233,7 +236,7 @@ class SimulatedDrives:
         coasts = experiment.base_rad_s and experiment.excitation.point is not Injection.SPEED
         if coasts:
             drawn, torque_per_amp = self.setups[row].machine, self._design.machine.machine.torque_nm(0.0, 1.0)
-            friction = drawn.tau_c + drawn.B * experiment.base_rad_s
+            friction = drawn.tau_c + (drawn.B + drawn.drag * experiment.base_rad_s) * experiment.base_rad_s
             drive.reference.i_q_ref = friction / torque_per_amp if torque_per_amp else 0.0
         start = self._starts[experiment.name, row]
         if experiment.excitation.point is Injection.SPEED:
