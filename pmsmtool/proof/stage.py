@@ -122,8 +122,9 @@ def _with_the_supply(conditions: Conditions, design: Design) -> Conditions:
     A rectifier takes nothing back: on one of 556 V the link stood at 633 V, and a healthy drive failed at 540 V.
     """
     supplied = design.machine.conditions.get(LINK_AT_REST)
-    raised = isinstance(supplied, float) and supplied < conditions.U_dc_v * (1.0 - U_DC_SPREAD)
-    return replace(conditions, U_dc_v=supplied) if raised else conditions
+    if isinstance(supplied, float) and supplied < conditions.U_dc_v * (1.0 - U_DC_SPREAD):
+        return replace(conditions, U_dc_v=supplied)
+    return conditions
 
 
 def _link_apart(experiment: Experiment, trace: Trace, conditions: Conditions, rated_v: float) -> str:
