@@ -21,7 +21,7 @@ from pmsmtool.drive.dead_man import DeadManProof, prove_dead_man, set_quick_stop
 from pmsmtool.drive.drive_node import is_safe, state_text
 from pmsmtool.drive.envelope import Envelope
 from pmsmtool.drive.heartbeat import Heartbeat
-from pmsmtool.drive.motion_objects import OVER_SPEED_TRIP, lowered_trip, trips_itself
+from pmsmtool.drive.motion_objects import OVER_SPEED_TRIP, encoder_counts, few_counts, lowered_trip, trips_itself
 from pmsmtool.drive.port import Excitation, Halves, Identity, Injection, ProfileMove, Recording, Shape
 from pmsmtool.drive.stop import interrupts_deferred
 from pmsmtool.errors import (
@@ -107,6 +107,7 @@ class GuardedDrive:
         self._asked_rad_s = 0.0
         self._kept_since_s: float | None = None
         self._pole_pairs = 1.0
+        self._counts: float | None = None
         self._R_s_ohm = 0.0
         self._limits = NO_LIMITS
 
@@ -125,6 +126,7 @@ class GuardedDrive:
         self._changed.begin()
         self._pole_pairs = self._drive.read("motor.pole_pairs")
         self._R_s_ohm = self._drive.read("motor.R_s_ohm")
+        self._counts = encoder_counts(self._node)
         self._refuse_unwatched()
         self._limit_in_drive()
         self._drive.stops_by_ramp = False
@@ -468,6 +470,8 @@ class GuardedDrive:
     def _likely(self, quantity: str) -> str:
         if quantity == "travel" and self.envelope.shaft == "locked":
             return _TURNS
+        if quantity == "current" and (few := few_counts(self._counts, self._pole_pairs)):
+            return f"{few}, and the current follows; less speed makes that less (--speed-max)"
         return _OTHER_UNIT.get(quantity, "") if self._drive.commands_bounded_current else ""
 
     def _check(self, quantity: str, value: float, limit: float, unit: str) -> None:

@@ -44,6 +44,9 @@ PERIOD_VALUE, PERIOD_EXPONENT = DriveObject(0x60C2, 1, "B"), DriveObject(0x60C2,
 """Time between two targets of a cyclic mode, value times 10^exponent s (CiA 402-2, interpolation time period)."""
 POSITION_TURNED = 0x80
 """Bit of the polarity that turns position against torque (CiA 402-2, 0x607E)."""
+FEW_COUNTS = 64.0
+"""Counts per electrical turn below which the steps of the angle disturb the current: runs at rated speed ended at the
+current limit with 23 and 43, and none with 85."""
 TURN_IN = {0x10: 2.0 * math.pi, 0x41: 360.0, 0x42: 21_600.0, 0x43: 1_296_000.0, 0xB4: 1.0}
 """A turn in radians, degrees, minutes and seconds of arc, and revolutions, by the unit's numerator (CiA 303-2)."""
 INCREMENTS = (0x00, 0xB5)
@@ -432,6 +435,14 @@ def _shown_units(node: DriveNode) -> float:
     if counts is None:
         raise NotAvailable(f"the drive does not report {NO_COUNTS}", where=f"node {node.node}")
     return counts
+
+
+def few_counts(counts: float | None, pole_pairs: float) -> str:
+    """Return what an encoder of few counts per electrical turn does to the current; empty where it has enough."""
+    if counts is None or not counts < FEW_COUNTS * pole_pairs:
+        return ""
+    each = counts / pole_pairs
+    return f"the encoder has {each:.3g} counts per electrical turn: each turns the voltage by {360.0 / each:.2g} deg"
 
 
 def encoder_counts(node: DriveNode) -> float | None:

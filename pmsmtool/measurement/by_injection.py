@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,6 +12,7 @@ from pmsmtool.cia402 import HOMING_LOST
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.envelope import Envelope, largest_acceleration, voltage_speed
 from pmsmtool.drive.guard import guarded
+from pmsmtool.drive.motion_objects import encoder_counts, few_counts
 from pmsmtool.errors import ConfigError
 from pmsmtool.experiments.rotation import dwell_within
 from pmsmtool.identification.by_injection import evaluated_stage
@@ -183,7 +185,10 @@ def plan(task: Task) -> tuple[Envelope, list[str]]:
         require_speed(envelope.speed_max_rad_s, nameplate.machine.top_rpm or 0.0)
     if "rotation" in steps:
         dwell_within(0.0, envelope.speed_max_rad_s)
-    return envelope, plan_lines(envelope, request, nameplate)
+    lines = plan_lines(envelope, request, nameplate)
+    if "speeds" in steps and (few := few_counts(encoder_counts(task.drive.node), nameplate.machine.pole_pairs)):
+        lines.append(f"{few}; it runs slower for that, and psi and J are less accurate")
+    return envelope, lines
 
 
 def measure(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Sequence[str]:
@@ -206,6 +211,7 @@ def measure(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Sequence[st
         omega_max_rad_s=min(envelope.speed_max_rad_s, sampled_rad_s),
         V_max_v=nameplate.inverter.V_max_v,
         i_d_max_apk=envelope.i_d_max_apk,
+        counts_per_turn=encoder_counts(task.drive.node) or math.inf,
     )
     with guarded(task.drive, envelope, first=starting_gains(limits, request.accuracy), say=say) as guard:
         measurement = Measurement(

@@ -135,6 +135,8 @@ class Limits:
     """Largest d current in the frame of the rotor (A peak)."""
     supply_w: float = math.inf
     """Largest power that the supply of the DC link is asked for (W)."""
+    counts_per_turn: float = math.inf
+    """Counts of the encoder in a mechanical turn; infinite where they are not known."""
 
     def __post_init__(self) -> None:
         """Refuse before anything moves."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from pmsmtool.arrays import Array
 from pmsmtool.design.loops.current_loop import imc
+from pmsmtool.drive.motion_objects import few_counts
 from pmsmtool.drive.port import Drive
 from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.resistance import ResistanceResult
@@ -75,10 +76,34 @@ not come to rest before their inertia was measured, and a third used up the run'
 QUICK_RAMP_SHARE, TORQUE_OVER = 0.65, 1.6
 """Accelerating current where an accuracy is enough, and the speed controller's largest torque, of that of the ramp:
 together the test current. With 0.8 an elastic shaft took it past the envelope (seed 733104)."""
+COUNT_SHARE = 0.3
+"""Current that a count of the encoder may cause in the flux run, of the test current (1). 1024 counts at 24 and 45 pole
+pairs caused 0.6 and 2.8 of it, and the run ended at its current limit."""
 SLOW_RUN_RAD_S = 2.0 * math.pi / 0.05
 """Speed below which the flux run is not slowed down: a turn there is as long as a window."""
 REST_SHARE, QUICK_REST_SHARE = 0.02, 0.05
 """Speed that counts as standstill, of the largest of the flux run; where the pulses wait for it once more."""
+
+
+def within_counts(
+    limits: Limits, omega_rad_s: float, psi_wb: float, pole_pairs: int, R_ohm: float, L_h: float, period_s: float
+) -> tuple[float, float]:
+    """Return largest mechanical speed and least current bandwidth (rad/s) beside the steps of a coarse encoder.
+
+    An angle that is half a count old turns the voltage against the back-EMF: v = pi p/N psi p omega. Near a whole
+    number of counts per control period that drifts slowly, and only the loop keeps its current down, v/(R + alpha L);
+    of n < 1 counts per period the drifting part is n v.
+    """
+    alpha = min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * period_s))
+    per_rad_s = math.pi * pole_pairs**2 * psi_wb / limits.counts_per_turn
+    per_period_s = limits.counts_per_turn * period_s / (2.0 * math.pi)
+    i_most = COUNT_SHARE * limits.I_test_apk
+    needed = (per_rad_s * omega_rad_s * min(1.0, per_period_s * omega_rad_s) / i_most - R_ohm) / L_h
+    if needed <= alpha:
+        return omega_rad_s, alpha
+    alpha = min(needed, 1.0 / (speed_run.LOOP_PERIODS * period_s))
+    most_rad_s = i_most * (R_ohm + alpha * L_h) / per_rad_s
+    return min(omega_rad_s, max(most_rad_s, math.sqrt(most_rad_s / per_period_s))), alpha
 
 
 def q_current_s(settle_s: float) -> float:
@@ -289,18 +314,17 @@ class SpeedStage:
         largest = min(largest, max(self.effort.speed_share * largest, SLOW_RUN_RAD_S))
         # the accelerating current must leave voltage for itself: omega_e L_q i_q stands beside the back-emf
         i_most = REACTANCE_SHARE * limits.V_max_v / (largest * pole_pairs * max(L))
+        R = self.drive.read("motor.R_s_ohm")
+        free, period_s = largest, self.drive.period_s
+        largest, alpha = within_counts(limits, free, psi, pole_pairs, R, min(L), period_s)
+        if largest < free:
+            why = few_counts(limits.counts_per_turn, pole_pairs) or "the steps of the encoder disturb the current"
+            self.say(f"  {why}: at most {rpm_from_rad_s(largest):.0f} rpm instead of {rpm_from_rad_s(free):.0f}")
         quick = self.effort.quick
         i_run, largest = ramp_of(limits, largest, i_most, torque_per_ampere(pole_pairs, psi), J, quick=quick)
         per_ampere = torque_per_ampere(pole_pairs, psi) / J
         # a current that is slow because the inverter's error is steep would not be steady in its window
-        loop = speed_run.steady_loop(
-            self.drive.read("motor.R_s_ohm"),
-            L,
-            V_dead_v,
-            min(map(min, self.effort.d_shares)) * run_i_d,
-            self.drive.period_s,
-            min(RUN_BANDWIDTH_RAD_S, 1.0 / (15.0 * self.drive.period_s)),
-        )
+        loop = speed_run.steady_loop(R, L, V_dead_v, min(map(min, self.effort.d_shares)) * run_i_d, period_s, alpha)
         i_q = min(0.5 * i_run, RUN_I_Q_SPEED_SHARE * largest / (q_current_s(loop.settle_s) * per_ampere))
         self._off_and_write(
             {

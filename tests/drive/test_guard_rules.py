@@ -91,6 +91,7 @@ def guard_of(drive: Shown, envelope: Envelope = ENVELOPE, R_s_ohm: float = 0.5) 
     made.energy_j = made.energised_s = made._asked_rad_s = 0.0
     made._start_rad, made._kept_since_s, made._looked_s = 1.0, None, drive.t_s
     made._speed_overshoot, made._pole_pairs, made._R_s_ohm = guarding.OVERSHOOT, POLE_PAIRS, R_s_ohm
+    made._counts = None
     return made
 
 
@@ -150,6 +151,20 @@ def test_a_limit_is_told_in_the_unit_it_was_given_in(drive: Shown, said: str, as
         guard_of(drive)._check(*asked)
     assert caught.value.what == said
     guard_of(drive)._check("a limit that was rounded", 4.0 * (1.0 + 1e-9), 4.0, "A")
+
+
+@pytest.mark.parametrize(("counts", "told"), [(None, False), (4096.0, False), (1024.0, True)])
+def test_a_coarse_encoder_is_the_likely_cause_of_a_current_beyond_its_limit(
+    drive: Shown, counts: float | None, told: bool
+) -> None:
+    """10 bits at 24 pole pairs: "raise the limit" was all that was said."""
+    guard = guard_of(drive)
+    guard._counts, guard._pole_pairs = counts, 24.0
+    with pytest.raises(LimitExceeded) as caught:
+        guard._check("current", 5.0, 4.0, "A")
+    assert ("42.7 counts per electrical turn" in caught.value.likely) is told
+    assert "8.4 deg" in guard._likely("current") or not told
+    assert "counts" not in guard._likely("speed")
 
 
 def test_an_excitation_keeps_narrower_limits_of_its_own(drive: Shown) -> None:

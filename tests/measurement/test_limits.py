@@ -96,7 +96,9 @@ def test_a_turn_is_sampled_a_dozen_times_at_the_largest_speed(
 
     monkeypatch.setattr(by_injection, "_nameplate", lambda task: stepper)
     monkeypatch.setattr(by_injection, "Limits", limits)
-    task = SimpleNamespace(run=SimpleNamespace(save=lambda *_: None), request=IdentifyRequest())
+    monkeypatch.setattr(by_injection, "encoder_counts", lambda node: None)
+    drive = SimpleNamespace(node=None)
+    task = SimpleNamespace(drive=drive, run=SimpleNamespace(save=lambda *_: None), request=IdentifyRequest())
     envelope = replace(envelope_of(stepper, IdentifyRequest()), speed_max_rad_s=697.0 * math.pi / 30.0)
     with pytest.raises(ConfigError, match="enough is known"):
         by_injection.measure(task, envelope, lambda *_: None, said.append)  # type: ignore[arg-type]
