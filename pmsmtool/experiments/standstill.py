@@ -96,9 +96,12 @@ DRIFTED = 5e-4
 CREPT = 1e-3
 """The same of the current, of the largest level, where the voltage's limit is ``DRIFTED``: a rotor that leaves a vector
 slowly turns the voltage into both."""
-LOOK_S = 0.03
-ARRIVED = 0.03
-"""Distance of the mean current vector from its set-point, relative, that counts as arrived."""
+LOOK_S, WINDOW_LOOK_S = 0.03, 0.02
+"""Time between two looks at a shaft, and where a window shows besides whether it moves: after shorter ones a load of 50
+times the inertia looked at rest where it turned back."""
+ARRIVED = 0.015
+"""Distance of the mean current vector from its set-point, relative, that counts as arrived. With 0.02 and more a slow
+current loop was still on its way in the windows of one of 16 drives, which then held all levels."""
 REST_LIMIT_S = 3.0
 """A rotor that has not come to rest by then stays as it is; the estimator sees it in the halves of the window."""
 NEAR_SHARE = 0.002
@@ -206,14 +209,22 @@ PERIODS = 512
 """Of the means of one vector, in two halves."""
 
 
+PHASE_ARRIVED = 0.03
+"""As ``ARRIVED``, of either half of their window: the phases' currents may differ by 10 %."""
+INDUCED = 0.1
+"""Voltage across a small vector, of the one along it, up to which a turning rotor induces little: what it adds to u/i
+is less still, and u/i may differ by 30 %."""
+
+
 def hold_phase_vectors(drive: Drive, i_a: float, angles_rad: Sequence[float] = PHASE_ANGLES_RAD) -> Trace:
     """Hold a small vector along each phase's axis and return one row of means for each.
 
     The drive is enabled on entry and holds zero current on return. It is off between two vectors: what its controller
     has wound up against an open phase must not meet the other two. Along :data:`NEAR_ANGLES_RAD` the rotor swings from
-    one to the next, and the rows show vector and encoder, too.
+    one to the next, and the rows show vector and encoder, too. Currents are waited for, not the rotor's rest: a rotor
+    that is still on its way leaves them as they are where it induces little.
     """
-    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
+    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "u_q_v", "i_d_a", "i_q_a", "theta_m_rad")
     rows: list[dict[str, float]] = []
     times = []
     elapsed = 0.0
@@ -228,19 +239,22 @@ def hold_phase_vectors(drive: Drive, i_a: float, angles_rad: Sequence[float] = P
         last = angle
         drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
         while True:
-            elapsed += settle(drive, i_a, arrival_s=ARRIVAL_LIMIT_S)
             first, second, _ = drive.halves(names, PERIODS // 2)
-            moved = abs(second["theta_m_rad"] - first["theta_m_rad"]) >= REST_RAD
-            missed = max(math.hypot(part["i_d_a"] - i_a, part["i_q_a"]) for part in (first, second))
-            # a rotor that turns back looks at rest, and a current that is late to what it induces looks unbalanced
-            stands = abs(second["theta_m_rad"] - before) < REST_RAD
-            if (not moved and (missed <= ARRIVED * i_a or stands)) or elapsed - begun > SWING_LIMIT_S:
-                break
+            elapsed += PERIODS * drive.period_s
+            halves = first, second
+            arrived = all(math.hypot(part["i_d_a"] - i_a, part["i_q_a"]) <= PHASE_ARRIVED * i_a for part in halves)
+            induced = any(abs(part["u_q_v"]) > INDUCED * abs(part["u_d_v"]) for part in halves)
+            # a rotor that turns back looks at rest in one window, not in two
+            rests = all(abs(second["theta_m_rad"] - seen) < REST_RAD for seen in (first["theta_m_rad"], before))
             before = second["theta_m_rad"]
+            if arrived and (rests or not induced):
+                break
+            if (rests and elapsed - begun >= ARRIVAL_LIMIT_S) or elapsed - begun > SWING_LIMIT_S:
+                break
         times.append(elapsed)
         row = {name: 0.5 * (first[name] + second[name]) for name in names if name != "theta_m_rad"}
         shown = {"theta_imposed_rad": angle, "theta_M_rad": second["theta_m_rad"]}
-        rows.append({**row, "moved": float(moved), **(shown if near else {})})
+        rows.append({**row, "moved": float(not (arrived or rests)), **(shown if near else {})})
     drive.command_current(0.0, 0.0, fixed_angle_rad=angle)
     return table(rows, times, i_command_a=i_a, angles_rad=list(angles_rad))
 
@@ -316,7 +330,7 @@ def hold_pairs(
         for current in sorted(currents_a, reverse=quick):  # on the larger a swing is short, and friction holds it then
             drive.command_current(current, 0.0, fixed_angle_rad=angle)
             for n in range(TRIES):
-                elapsed += settle(drive, current, stood_rad=stood)
+                elapsed += settle(drive, current, look_s=WINDOW_LOOK_S, stood_rad=stood)
                 first, second, samples = drive.halves(names, half)
                 moved = abs(second["theta_m_rad"] - first["theta_m_rad"]) >= REST_RAD
                 missed = max(abs(part["i_d_a"] - current) for part in (first, second))
@@ -354,24 +368,23 @@ def turn_and_look(drive: Drive, i_a: float, start_rad: float, end_rad: float, tu
 
 
 def settle(
-    drive: Drive, i_d_a: float, *, arrival_s: float = REST_LIMIT_S, near_a: float = 0.0, stood_rad: float = math.inf
+    drive: Drive, i_d_a: float, *, look_s: float = LOOK_S, near_a: float = 0.0, stood_rad: float = math.inf
 ) -> float:
     """Wait until the current has arrived and the shaft stands still, or a limit is over; return the time (s).
 
     ``stood_rad`` is where the shaft stood before the current changed: there it is at rest at the first look.
-    A current that has not arrived is waited for as long as the shaft moves, and ``arrival_s`` at least. A flag ends it:
-    what is limited or at full scale does not settle, it winds up.
+    A flag ends it: what is limited or at full scale does not settle, it winds up.
     """
-    periods = max(1, round(0.25 * LOOK_S / drive.period_s))
+    periods = max(1, round(0.25 * look_s / drive.period_s))
     waited = 0.0
     last = stood_rad
     while waited < REST_LIMIT_S:
-        drive.wait(LOOK_S)
-        waited += LOOK_S
+        drive.wait(look_s)
+        waited += look_s
         now = drive.average(("theta_m_rad", "i_d_a", "i_q_a", "flags"), periods)
         arrived = math.hypot(now["i_d_a"] - i_d_a, now["i_q_a"]) <= max(ARRIVED * abs(i_d_a), near_a)
         at_rest = abs(now["theta_m_rad"] - last) < REST_RAD
-        if (at_rest and (arrived or waited >= arrival_s)) or (now["flags"] > 0.0 and not arrived):
+        if (at_rest and arrived) or (now["flags"] > 0.0 and not arrived):
             break
         last = now["theta_m_rad"]
     return waited
@@ -418,7 +431,7 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
         drive.wait(plan.settle_s)
         elapsed += plan.settle_s
         for k in range(TRIES):
-            elapsed += settle(drive, abs(level), near_a=NEAR_SHARE * largest, stood_rad=stood)
+            elapsed += settle(drive, abs(level), look_s=WINDOW_LOOK_S, near_a=NEAR_SHARE * largest, stood_rad=stood)
             if not looked and abs(level) == largest:  # under which a supply gives way
                 half, looked = steady_half(drive, plan.window_periods) or half, True
             first, second, samples = drive.halves(names, half)

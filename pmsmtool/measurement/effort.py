@@ -126,7 +126,7 @@ LEVEL_EFFORTS = (
 )
 SHOT_EFFORTS = (256, 512, 1024, square_injection.SHOT_SAMPLES)
 _TWO_SPEEDS = SpeedEffort(
-    (0.42, 0.85), ((1.0,), (1.0 / 3.0, 1.0, 1.0)), (0,), window_s=0.04, push_samples=256, mechanics_rows=800,
+    (0.42, 0.85), ((1.0,), (1.0 / 3.0, 1.0, 1.0)), (0,), window_s=0.04, push_samples=128, mechanics_rows=400,
     answer_samples=64, answer_share=0.05, quick=True,
 )  # fmt: skip
 SPEED_EFFORTS = (replace(_TWO_SPEEDS, speed_share=0.5), _TWO_SPEEDS, ALL_SPEEDS)

@@ -178,8 +178,8 @@ EMF_SHARE = 0.6
 ABORT_SHARE = 0.95
 SLOW_SHARE = 0.2
 """Largest speed of the slow turns, of the speed limit."""
-REST_SHARE = 0.02
-"""Largest speed before the first push, of the speed that it is to reach."""
+REST_SHARE, AFTER_SHARE = 0.02, 0.1
+"""Largest speed before the first push, and after the last coasting, of the speed that a push is to reach."""
 PLAN_LINE = "torque pulses turn the shaft both ways, and it coasts with the voltage off"
 
 
@@ -230,7 +230,7 @@ def measure_mechanics(
     abort = ABORT_SHARE * pole_pairs * limits.omega_max_rad_s
     mechanics_run.push_and_coast(drive, plan, abort, keep_part)
     drive.enable()
-    _come_to_rest(drive, pole_pairs * plan.omega_rad_s, look_s)
+    _come_to_rest(drive, pole_pairs * plan.omega_rad_s, look_s, AFTER_SHARE)
 
 
 def measure_cogging(
@@ -245,11 +245,11 @@ def measure_cogging(
     speed_run.reach(drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * pole_pairs * limits.omega_max_rad_s)
 
 
-def _come_to_rest(drive: Drive, reached_rad_s: float, look_s: float) -> None:
-    """Stop the shaft by the speed controller, from the speed it has or that of the pushes (electrical)."""
+def _come_to_rest(drive: Drive, reached_rad_s: float, look_s: float, share: float = REST_SHARE) -> None:
+    """Stop the shaft by the speed controller, from the speed it has or that of the pushes (electrical), to a share."""
     from_rad_s = max(reached_rad_s, abs(drive.live("omega_e_rad_s")))
     drive.command_speed(0.0)
-    band = REST_SHARE * reached_rad_s
+    band = share * reached_rad_s
     rate = rad_s_from_rpm(drive.read("speed.acceleration_rpm_per_s")) * drive.read("motor.pole_pairs")
     ramp_s = min(speed_run.RAMP_MOST_S, speed_run.RAMP_DOUBT * from_rad_s / rate) if rate > 0.0 else 0.0
     waited = speed_run.reach(drive, 0.0, limit_s=speed_run.REACH_LIMIT_S + ramp_s, band_rad_s=band, look_s=look_s)

@@ -90,7 +90,7 @@ def test_what_an_effort_leaves_out_is_said_by_quantity() -> None:
         "R": "12 of 28 levels",
         "L": "one of two fast square waves, up to 1792 of 2048 samples of a square wave",
         "psi": "2 of 4 speeds in each direction, down to 50 % of the largest speed, 4 of 8 d currents",
-        "mechanics": "1200 of 2000 rows of a torque pulse",
+        "mechanics": "1600 of 2000 rows of a torque pulse",
     }
     assert "psi" not in effort_for(0.01, predicting(1e-4, 1e-4, 1e-1)).left_out
 

@@ -15,10 +15,11 @@ from pmsmtool.drive.port import Halves
 from pmsmtool.experiments import standstill
 from pmsmtool.experiments.standstill import (
     ARRIVAL_LIMIT_S,
-    ARRIVED,
     DC_ANGLE_RAD,
+    INDUCED,
     NEAR_ANGLES_RAD,
     PAIR_ARRIVED,
+    PHASE_ARRIVED,
     SWINGING_TURN_S,
     LevelPlan,
     calm_sequence,
@@ -147,7 +148,28 @@ class SwingingDrive(LateDrive):
 def test_a_small_vector_waits_for_a_rotor_that_swings_past_its_rest() -> None:
     """2.9 kg m2 on 45 mA: where it turns back it looks at rest, and the phases of a healthy machine were 11 % apart."""
     vectors = hold_phase_vectors(SwingingDrive(), I_A)  # type: ignore[arg-type]
-    assert vectors["i_d_a"] == pytest.approx([I_A] * 3, rel=ARRIVED) and not np.any(vectors["moved"])
+    assert vectors["i_d_a"] == pytest.approx([I_A] * 3, rel=PHASE_ARRIVED) and not np.any(vectors["moved"])
+
+
+class TurningDrive(SwingingDrive):
+    """Its currents are there at once, and what it induces dies away."""
+
+    CURRENT_PER_RAD, induced = 0.1, 0.0
+
+    def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
+        across = self.induced * math.exp(-self.DECAY * self.t)
+        return {**super().average(signals, periods), "u_d_v": 1.0, "u_q_v": across}
+
+
+@pytest.mark.parametrize(("induced", "least_s", "most_s"), [(0.5 * INDUCED, 0.0, 0.3), (2.0 * INDUCED, 2.0, 10.0)])
+def test_a_rotor_on_its_way_is_waited_for_while_it_induces_a_voltage(
+    induced: float, least_s: float, most_s: float
+) -> None:
+    """At rest its currents are the same: three vectors took up to 0.8 s longer."""
+    drive = TurningDrive()
+    drive.induced = induced
+    vectors = hold_phase_vectors(drive, I_A)  # type: ignore[arg-type]
+    assert least_s <= drive.waited <= most_s and not np.any(vectors["moved"])
 
 
 def test_a_current_that_does_not_come_at_a_shaft_that_stands_is_not_waited_for() -> None:
