@@ -326,7 +326,7 @@ def _tell(
     data |= {"accuracy": accuracy} if accuracy else {}
     compared = [] if comparison is None else comparison.lines()
     data |= {} if comparison is None else {"fingerprint": comparison.facts()}
-    out.result("identify", data, [*table(heads, rows), *compared])
+    out.result("identify", data, [*(table(heads, rows) if rows else ()), *compared])
     for line in stage.fallbacks if ended else warnings:  # what ended it is said last
         out.warn(line)
     if accuracy and stage.status == "pass":
