@@ -374,15 +374,11 @@ def test_a_hard_drive_whose_levels_end_within_its_knee_has_an_interval_that_says
     assert abs(R.value - d.R[0]) < total_half_width(R) and total_half_width(R) > R.value and WITHIN_KNEE in R.fallback
 
 
-@pytest.mark.parametrize(
-    ("error", "knee", "shape", "more"), [(9.0, 0.12, 1.0, 0.4), (9.0, 0.12, 4.0, 0.4), (9.0, 0.12, 3.0, 0.5)]
-)
-def test_levels_within_the_knee_are_left_out_where_the_model_misses_them(
-    error: float, knee: float, shape: float, more: float
-) -> None:
+@pytest.mark.parametrize("shape", [1.0, 3.0, 4.0])
+def test_levels_within_the_knee_are_left_out_where_the_model_misses_them(shape: float) -> None:
     """R was +13 and -10 % off at +-2 %, and refused; what it moved by is in its interval."""
-    d, rng = hard_drive(error, knee)
-    d.shape[:] = shape
+    d, rng = hard_drive(9.0, 0.12)
+    d.shape[:], more = shape, 0.5
     trace, noise = levels_of(d, 0, rng), noise_of(d, 0)
     found = estimate_resistance(trace, noise).R_measured
     assert abs(found.value - d.R[0]) < total_half_width(found)
@@ -390,6 +386,17 @@ def test_levels_within_the_knee_are_left_out_where_the_model_misses_them(
     assert f"levels below {more:g} of the largest left out" in found.fallback
     alone = estimate_resistance(trace, noise, fit_from=more).R_measured
     assert alone.value == found.value and found.std > 2.0 * alone.std
+
+
+def test_levels_within_a_knee_are_left_out_where_the_tails_bend_to_fit_them() -> None:
+    """The knee of a motor of 0.08 ohm behind 328 V: R was 9.5 % off at +-1.7 %; measured 0.9 at +-8.4 %."""
+    d, rng = hard_drive(6.4, 0.12)
+    trace, noise, largest_a = levels_of(d, 0, rng), noise_of(d, 0), float(d.I_r[0])
+    i = trace["i_d_a"]
+    error_v = 6.4 * d.R[0] * largest_a * np.sign(i) * -np.expm1(-((np.abs(i) / (0.1 * largest_a)) ** 1.2))
+    v = dict.fromkeys(("u_d_v", "u_d_first_v", "u_d_second_v"), d.R[0] * i + error_v)
+    found = estimate_resistance(replace(trace, signals={**trace.signals, **v}), noise).R_measured
+    assert abs(found.value - d.R[0]) < total_half_width(found)
 
 
 def test_a_hard_drive_is_refused_by_name_when_the_interval_is_too_wide() -> None:
