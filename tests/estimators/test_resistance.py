@@ -247,6 +247,17 @@ def test_a_knee_that_bends_within_the_levels_hides_less_than_its_plateau() -> No
     assert abs(R.value - d.R[0]) < half < 0.65 * dead_v / largest and WITHIN_KNEE in R.fallback  # 0.57; 1.19 before
 
 
+def test_a_threshold_of_the_devices_is_not_taken_for_the_plateau() -> None:
+    """0.4 A at 560 V: 1 V and a straight line were 0.31 of the plateau, and R 31 % off at +-3.4 %, exit 0."""
+    d, rng = hard_drive(0.4, 1.5)
+    trace, volts = levels_of(d, 0, rng), float(d.R[0] * d.I_r[0])
+    i = trace["i_d_a"]
+    v = dict.fromkeys(("u_d_v", "u_d_first_v", "u_d_second_v"), 1.3 * d.R[0] * i + 0.16 * volts * np.sign(i))
+    found = estimate_resistance(replace(trace, signals={**trace.signals, **v}), noise_of(d, 0), plateau_v=0.4 * volts)
+    assert abs(found.R_measured.value - d.R[0]) < total_half_width(found.R_measured)  # measured 0.30 within 0.35
+    assert WITHIN_KNEE in found.R_measured.fallback
+
+
 def estimate_or_none(levels: Trace, noise: Noise, plateau_v: float) -> Estimate | None:
     """Return R at the temperature of the test, None where it is refused."""
     try:
