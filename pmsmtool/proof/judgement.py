@@ -104,6 +104,14 @@ SHAKES = (
     "the machine shakes in steady state by more than the band: an encoder off centre behind a stiff speed loop, an "
     "elastic shaft, cogging, or a link with ripple"
 )
+SPEED_STEP = ("speed_step", "i_q_a")
+OSCILLATES = (
+    "the speed loop oscillates: a load behind an elastic shaft that identification did not see, or too coarse an "
+    "encoder (a slower loop: tune --speed-bandwidth-hz)"
+)
+SWINGS_MORE = 3
+"""Swings between half of the largest predicted current and minus that, beyond the predicted ones, that count as one: a
+load of 13 times the inertia behind 450 Hz made 3 at standstill, and a wrong sign of the decoupling was named."""
 TOLD_APART = 0.05
 """Least mean square by which patterns differ in a wave over the angle that is taken out of them; most is 0.5."""
 RIPPLE_SIGMAS = 3.0
@@ -229,12 +237,23 @@ def judge(prediction: Prediction, measured: Mapping[tuple[str, str], Array]) -> 
     keys = {key for key in measured if f"{key[0]}: {key[1]}" in outside}
     only_quantities = not keys
     keys |= {key for name, q in prediction.quantities.items() if name in outside for key in q.signature}
+    if SPEED_STEP in keys and _swings_more(measured[SPEED_STEP], prediction.bands[SPEED_STEP].mean):
+        return Judgement(found.seen, OSCILLATES)
     cause = likely_cause(prediction, {key: measured[key] for key in sorted(keys)}, measured)
     if not cause and only_quantities:  # no response alone is far enough off to tell, but what they tell together is
         cause = _cause_of_quantities(prediction, deviation)
     if not cause and any(b.ripple >= _most_ripple(b) for b in map(prediction.bands.__getitem__, keys)):
         cause = SHAKES
     return Judgement(found.seen, cause)
+
+
+def _swings_more(response: Array, predicted: Array) -> bool:
+    """Return whether a response goes between half of the largest predicted value and minus that, and was not to."""
+    swings = []
+    for values in (response, predicted):
+        large = values[np.abs(values) > 0.5 * np.max(np.abs(predicted))]
+        swings.append(int(np.sum(np.diff(np.sign(large)) != 0.0)))
+    return swings[0] >= swings[1] + SWINGS_MORE
 
 
 def _most_ripple(band: Band) -> float:

@@ -12,7 +12,16 @@ import pytest
 from pmsmtool.design.prediction import LEAST_FACTOR, Direction, Prediction, predict
 from pmsmtool.errors import ConfigError
 from pmsmtool.npz_file import npz_bytes
-from pmsmtool.proof.judgement import SHAKES, from_arrays, judge, patterns, to_arrays, with_ripple
+from pmsmtool.proof.judgement import (
+    OSCILLATES,
+    SHAKES,
+    SPEED_STEP,
+    from_arrays,
+    judge,
+    patterns,
+    to_arrays,
+    with_ripple,
+)
 from pmsmtool.trace import Trace
 
 ROWS = 120
@@ -176,6 +185,16 @@ def test_a_machine_that_shakes_passes_and_one_that_shakes_too_much_does_not() ->
         assert "ripple" in judge(wider, {KEY: shaken}).seen[0].where
         assert passes or judge(wider, {KEY: shaken}).cause == SHAKES
         assert half(wider) <= 2.0 * half(found) * 1.001
+
+
+@pytest.mark.parametrize(("size", "named"), [(0.4, False), (0.8, True)])
+def test_a_current_that_swings_between_both_signs_is_an_oscillation(size: float, named: bool) -> None:
+    """A wrong sign of the decoupling was named where a speed loop swung the torque from limit to limit."""
+    found = prediction()
+    found = replace(found, bands={SPEED_STEP: found.bands[KEY]}, t_s={"speed_step": T_S}, quantities={}, faults={})
+    swinging = found.bands[SPEED_STEP].mean * (T_S > 60e-4) + size * np.cos(3e3 * T_S) * (T_S <= 60e-4)
+    judged = judge(found, {SPEED_STEP: swinging})
+    assert not judged.inside and (judged.cause == OSCILLATES) == named
 
 
 def test_what_is_off_or_still_on_its_way_is_no_ripple() -> None:
