@@ -234,7 +234,7 @@ def hold_phase_vectors(drive: Drive, i_a: float, angles_rad: Sequence[float] = P
         if rows:
             drive.disable()
             drive.enable()
-        begun, before = elapsed, math.inf
+        begun, before, since, stays_a = elapsed, math.inf, elapsed, complex(math.inf)
         if rows and near:
             elapsed += turn_vector(drive, i_a, last, angle, None)
         last = angle
@@ -250,7 +250,12 @@ def hold_phase_vectors(drive: Drive, i_a: float, angles_rad: Sequence[float] = P
             before = second["theta_m_rad"]
             if arrived and (rests or not induced):
                 break
-            if (rests and elapsed - begun >= ARRIVAL_LIMIT_S) or elapsed - begun > SWING_LIMIT_S:
+            if not abs((i_dq_a := complex(second["i_d_a"], second["i_q_a"])) - stays_a) <= PHASE_ARRIVED * i_a:
+                stays_a, since = (
+                    i_dq_a,
+                    elapsed,
+                )  # a small swing, too, induces a current: only one that stays never comes
+            if (rests and elapsed - since >= ARRIVAL_LIMIT_S) or elapsed - begun > SWING_LIMIT_S:
                 break
         times.append(elapsed)
         row = {name: 0.5 * (first[name] + second[name]) for name in names if name != "theta_m_rad"}

@@ -151,6 +151,14 @@ def test_a_small_vector_waits_for_a_rotor_that_swings_past_its_rest() -> None:
     assert vectors["i_d_a"] == pytest.approx([I_A] * 3, rel=PHASE_ARRIVED) and not np.any(vectors["moved"])
 
 
+def test_a_swing_too_small_for_the_encoder_is_waited_for_while_its_current_does_not_stay() -> None:
+    """0.125 ohm and 6 Hz: 0.5 mrad kept i_d 10 % off, and a healthy machine was refused with E_UNBALANCED."""
+    drive = SwingingDrive()
+    drive.OMEGA, drive.DECAY, drive.SWING_RAD, drive.CURRENT_PER_RAD = 38.0, 0.6, 2e-4, 1200.0  # type: ignore[misc]
+    vectors = hold_phase_vectors(drive, I_A)  # type: ignore[arg-type]
+    assert vectors["i_d_a"] == pytest.approx([I_A] * 3, rel=PHASE_ARRIVED) and not np.any(vectors["moved"])
+
+
 class TurningDrive(SwingingDrive):
     """Its currents are there at once, and what it induces dies away."""
 
