@@ -65,9 +65,10 @@ FIT_FROM = 0.28
 """Fraction of the largest level from which on levels enter the fit; the lower ones serve the inverter curve."""
 FIT_FROM_FURTHER, KNEE_GAIN, LACKING = (0.4, 0.5), 0.5, 0.05
 """The same where the first level lies within the knee: there the error has no such tail. The part of chi-square that
-must be left, and what the error lacks there to its highest, of R times the largest: 0.11 to 3.2 in knees, 0.02 and less
-elsewhere. Whether the tails fit is not asked: they bend, and R of 300 drawn drives with an error of 2 to 12 R I was
-outside its interval on 26, at 5.3 of it; now on none (0.93), half widths are 3.9 instead of 3.1 % (median)."""
+must be left, where R stays within both intervals; what the error lacks there to its highest, of R times the largest:
+0.11 to 3.2 in knees, 0.02 and less elsewhere. Whether the tails fit is not asked: they bend, and R of 300 drawn drives
+with an error of 2 to 12 R I was outside its interval on 26, at 5.3 of it; now on none (0.93), half widths are 3.9
+instead of 3.1 % (median)."""
 CHI2_HOPELESS = 100.0
 """Reduced chi-square above which no number is given; from the usual limit on, what the fit leaves (0.05 % of R I_r at
 6.2, on a link that falls by 6 % under load and has 4 % of ripple) is a standard deviation of R besides."""
@@ -261,7 +262,10 @@ def estimate_resistance(
             further = estimate_resistance(
                 levels, noise, tolerance=tolerance, copper=copper, plateau_v=plateau_v, fit_from=more[0]
             )
-            if further.R_measured.chi2 < KNEE_GAIN * chi2:
+            scatter_ohm = math.sqrt(sum(w * fit.covariance[0, 0] for w, fit in zip(weights, fits, strict=True)))
+            both_ohm = COVERAGE_FACTOR * math.hypot(further.R_measured.std, scatter_ohm)
+            apart = abs(further.R_measured.value - R_w) > both_ohm  # the scatter of the levels is in both chi-squares
+            if apart or further.R_measured.chi2 < KNEE_GAIN * chi2:
                 half_ohm = 0.5 * (further.R_measured.value - R_w)  # other knees leave up to 0.6 of what they had
                 R_s, measured = (replace(e, std=math.hypot(e.std, half_ohm)) for e in (further.R_s, further.R_measured))
                 return replace(further, R_s=R_s, R_measured=measured)
