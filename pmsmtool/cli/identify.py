@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -284,9 +284,10 @@ def _accounted(run: RunDirectory, out: Output) -> Iterator[Callable[[str], None]
         shutil.rmtree(run.path, ignore_errors=True)
         raise
     except BaseException:
-        stage = run.read().stage("identify")
-        if stage is not None and (stage.values or stage.refused):
-            _tell(run, stage, out, ended=True)
+        with suppress(Exception):  # what ended the run outranks a record that cannot be read, or a closed output
+            stage = run.read().stage("identify")
+            if stage is not None and (stage.values or stage.refused):
+                _tell(run, stage, out, ended=True)
         out.note(f"how it ended, and what is complete: pmsmtool report {run.path}")
         raise
 

@@ -130,6 +130,16 @@ def test_whatever_ends_it_is_written_down(
     assert account["what"] == str(error.args[0])
 
 
+def test_a_record_that_cannot_be_read_hides_no_limit(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stage(run: RunDirectory, *asked: object, **more: object) -> None:
+        (run.path / "run.json").write_text("{")
+        raise LimitExceeded("current", 9.0, 7.5, "A", where="node 1")
+
+    monkeypatch.setattr(identify, "identify", stage)
+    code, _, err = tool(*IDENTIFY)
+    assert code == 5 and "is outside the limit" in err
+
+
 def test_a_killed_run_is_not_taken_for_a_complete_one(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A kill and a power cut close nothing: the account stays open, and half a file keeps the name of half a file."""
     monkeypatch.setattr(identify, "identify", lambda run, *rest, **more: stopped_dead(run))
