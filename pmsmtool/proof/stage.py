@@ -199,7 +199,8 @@ def prove_stage(
     refuse_other_set(drive.node, design)
     envelope = envelope_of(design, request)
     envelope.refuse_gravity()
-    conditions = _with_the_supply(conditions_of(drive, envelope), design)
+    shown = conditions_of(drive, envelope)
+    conditions = _with_the_supply(shown, design)
     plan = _shown(plan_proof(design, conditions), request.experiments)
     envelope = envelope_of(design, request, plan)
     allow_motion([*envelope.lines(), *(e.text for e in plan.experiments), "nothing is stored in the drive"])
@@ -224,8 +225,13 @@ def prove_stage(
             raise
         event = error  # the guard has stopped the machine and restored the drive
     stage = _stage(plan, record, event, digest, folder)
-    wider = (BENT,) if bend_of(design.machine) else ()
-    return replace(stage, not_checked=_beyond(design, conditions), fallbacks=(*stage.fallbacks, *wider))
+    told = [BENT] if bend_of(design.machine) else []
+    if conditions.U_dc_v < shown.U_dc_v:
+        told.append(
+            f"the DC link stands at {shown.U_dc_v:.4g} V, raised by braking: predicted with the "
+            f"{conditions.U_dc_v:.4g} V that identification met"
+        )
+    return replace(stage, not_checked=_beyond(design, conditions), fallbacks=(*stage.fallbacks, *told))
 
 
 def rated_rpm(design: Design) -> float:

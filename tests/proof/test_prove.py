@@ -251,6 +251,7 @@ def test_a_link_below_what_it_showed_at_rest_is_named_or_was_raised_by_braking(
         _, stage = prove(drive, design, asked=replace(FEW, experiments=("unreachable",)))
     assert stage.status == ("pass" if supplied else "fail"), stage.note
     assert ("likely the voltage is too low" in stage.note) == (not supplied)
+    assert ("stands at 540 V, raised by braking: predicted with the 459 V" in str(stage.fallbacks)) == bool(supplied)
 
 
 def test_what_a_sagging_link_decides_is_not_judged(design: Design) -> None:
