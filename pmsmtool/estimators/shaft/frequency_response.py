@@ -236,13 +236,17 @@ def _judged(
         reason = f"rigid up to {highest:.3g} Hz: no pair of poles fits; {shown}"
         return FrequencyResponse(*facts, math.nan, 0.0, reason=reason, inertia=one, shown_hz=to_hz), lines, rigid
     two = _fit(lines, _two_mass, start)
-    chi2 = two.cost / two.dof
     # the same transients, rung by something else than the torque
     ringing = _fit(lines, lambda at, x: (_rigid(at, x)[0], _two_mass(at, two.x)[1]), rigid.x)
-    terms = len(start) - len(rigid.x)
     penalty = math.log(len(rigid.residual))
-    without = min(rigid.cost - 2 * len(U) * penalty, ringing.cost)
-    gain = (without - two.cost) / max(1.0, chi2) - terms * penalty
+    transients = 2 * len(U) * penalty
+    without, cost = min(rigid.cost, ringing.cost + transients), two.cost + transients
+    if _decays(two, lines):
+        unrung = _fit(lines, lambda at, x: (_two_mass(at, x)[0], _rigid(at, x)[1]), two.x)
+        if unrung.cost < cost and _decays(unrung, lines):
+            two, cost = unrung, unrung.cost
+    chi2 = two.cost / two.dof
+    gain = (without - cost) / max(1.0, chi2) - (len(start) - len(rigid.x)) * penalty
     estimates = _estimates(two, chi2)
     against = _against(two, chi2, gain, estimates, frequency)
     both = _inertia(two, chi2, (-1.0, 0.0, 2.0, 0.0, -2.0, 0.0), *scale)
@@ -257,6 +261,12 @@ def _judged(
     resonance, antiresonance = estimates["resonance_hz"].value, estimates["antiresonance_hz"].value
     reason = f"two masses, J_load/J_motor {(resonance / antiresonance) ** 2 - 1.0:.3g}, measured up to {highest:.3g} Hz"
     return FrequencyResponse(*facts, chi2, gain, estimates, reason, both), lines, rigid
+
+
+def _decays(fit: Fit, lines: _Lines) -> bool:
+    """Whether poles, damped as those of a coupling, ring so shortly that their peak is wider than the polynomials."""
+    w_r, zeta_r = np.exp(fit.x[2:4])
+    return bool(zeta_r <= CERTAIN_ZETA and 2.0 * zeta_r * w_r >= 2 * HALF_WIDTH * (lines.omega[1] - lines.omega[0]))
 
 
 def _rigid_shaft(
