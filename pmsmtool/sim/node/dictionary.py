@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator
+from functools import cache
 from typing import TYPE_CHECKING, Protocol
 
 from pmsmtool.bus.abort_codes import AbortCode
@@ -44,11 +45,6 @@ class Entry:
         The application's hooks for reading and writing.
     """
 
-    __slots__ = (
-        "_is_float", "_range", "code", "high", "low", "nan_allowed", "readable", "row", "sink", "size", "source",
-        "value", "writable",
-    )  # fmt: skip
-
     def __init__(self, row: ObjectRow, node: int) -> None:
         self.row = row
         kind = row.data_type
@@ -64,6 +60,14 @@ class Entry:
         self.source: Source | None = None
         self.sink: Sink | None = None
         self.value = row.default_bytes(node)
+
+    def twin(self, node: int) -> Entry:
+        """Return an entry as this one began, of a node: what only depends on the row is not worked out again."""
+        twin = object.__new__(Entry)
+        twin.__dict__ = self.__dict__.copy()
+        if "$NODEID" in self.row.default:
+            twin.value = self.row.default_bytes(node)
+        return twin
 
     def read(self) -> bytes:
         """Return the bytes of the value."""
@@ -124,6 +128,11 @@ def _held_as(code: struct.Struct | None, bound: float | None) -> float | None:
         return None
 
 
+@cache
+def _entries_of_rows() -> dict[int, Entry]:
+    return {row.index << 8 | row.sub: Entry(row, 0) for row in object_rows()}
+
+
 class Dictionary:
     """All entries of one node, by object and by key.
 
@@ -137,8 +146,8 @@ class Dictionary:
 
     def __init__(self, node: int) -> None:
         self.node = node
-        self._entries = {row.index << 8 | row.sub: Entry(row, node) for row in object_rows()}
-        self._indices = {row.index for row in object_rows()}
+        self._entries = {key: entry.twin(node) for key, entry in _entries_of_rows().items()}
+        self._indices = {key >> 8 for key in self._entries}
         self.by_key = {entry.row.key: entry for entry in self._entries.values() if entry.row.key}
         self.on_change: Callable[[Entry], None] = lambda entry: None
         self._hidden: set[int] = set()
