@@ -38,6 +38,8 @@ EARLY_S, LATE_S, AGE_S = 2e-3, 1e-2, 5e-3
 FIRST_BANDWIDTHS = (25.0, 90.0)
 FIRST_SHARE = 0.2
 """First values of K_p / J (1/s), and of K_i / K_p as a share of it: from each the fit is begun."""
+ROUGHLY = 1e-5
+"""Change of the squares at which these fits end; the last one begins at the better of both."""
 LEAST_SAMPLES = 30
 PULSE_BEGIN_S, PULSE_BIN_S, PULSE_HELD = 2e-3, 2e-3, 0.9
 """When the current of a torque pulse counts (s); the bins (s), and the share of its level, by which its end is seen."""
@@ -103,8 +105,8 @@ class StepRecord:
         """Return the angle that the references ask for up to instants (rad). Shape as ``t_s``."""
         times, values = np.array(self.references).T
         passed = np.concatenate(([0.0], np.cumsum(np.diff(times) * values[:-1])))
-        at = np.clip(np.searchsorted(times, t_s, side="right") - 1, 0, None)
-        return np.asarray(passed[at] + (t_s - times[at]) * values[at])
+        outside = values[0] * np.minimum(t_s - times[0], 0.0) + values[-1] * np.maximum(t_s - times[-1], 0.0)
+        return np.interp(t_s, times, passed) + outside
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,19 +207,20 @@ class _Model:
         return mean
 
     def modes(self, p: Array) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return poles and residues of speed over reference."""
+        """Return poles and residues of speed over reference; a pair as one pole with twice the residue."""
         a, b, lag_s = np.exp(p[:3])
         corner = self.emf.corner_rad_s
-        numerator = np.polymul([a, b], [1.0, corner])
-        open_loop = np.array([1.0, corner * (1.0 + self.emf.share), 0.0, 0.0])
-        lag = np.poly1d([lag_s / STAGES, 1.0]) ** STAGES
-        loop = np.polyadd(np.polymul(open_loop, lag.coeffs), numerator)
+        numerator = np.array([a, b + a * corner, b * corner])
+        lag = np.array([math.comb(STAGES, k) * (lag_s / STAGES) ** (STAGES - k) for k in range(STAGES + 1)])
+        loop = np.convolve([1.0, corner * (1.0 + self.emf.share), 0.0, 0.0], lag)
+        loop[-3:] += numerator
         if not self.forward:
-            numerator = np.polymul(numerator, lag.coeffs)
+            numerator = np.convolve(numerator, lag)
         poles = np.roots(loop).astype(np.complex128)
+        poles = poles[poles.imag >= 0.0]
         poles *= 1.0 + 1e-7 * np.arange(len(poles))  # no two the same
-        residues: NDArray[np.complex128] = np.polyval(numerator, poles) / np.polyval(np.polyder(loop), poles)
-        return poles, residues
+        residues = np.polyval(numerator, poles) / np.polyval(np.polyder(loop), poles)
+        return poles, np.where(poles.imag > 0.0, 2.0, 1.0) * residues
 
     def answer(self, p: Array) -> tuple[Array, Array, Array, NDArray[np.complex128]]:
         """Return angle, speed and acceleration on the grid, and the poles."""
@@ -225,14 +228,12 @@ class _Model:
 
         poles, residues = self.modes(p)
         reference = self.reference(p[3])
-        grown = np.exp(poles * GRID_S)
-        states = [
-            lfilter([0.0, (g - 1.0) / pole], [1.0, -g], reference.astype(np.complex128))
-            for g, pole in zip(grown, poles, strict=True)
-        ]
-        speed = sum(r * x for r, x in zip(residues, states, strict=True)).real
-        acceleration = sum(r * pole * x for r, pole, x in zip(residues, poles, states, strict=True)).real
-        acceleration = acceleration + residues.sum().real * reference
+        driven, speed, acceleration = reference.astype(np.complex128), 0.0, residues.sum().real * reference
+        for pole, residue in zip(poles, residues, strict=True):
+            grown = np.exp(pole * GRID_S)
+            answer = lfilter([0.0, residue * (grown - 1.0) / pole], [1.0, -grown], driven)
+            speed = speed + answer.real
+            acceleration = acceleration + (pole * answer).real
         angle = GRID_S * (np.cumsum(speed) - 0.5 * speed)
         return angle, speed, acceleration, poles
 
@@ -244,15 +245,19 @@ class _Model:
         """
         record, t = self.record, self.record.t_s
         angle, speed, acceleration, poles = self.answer(p)
-        slow = poles[np.argsort(np.abs(poles))][:2]
+        slow = poles[np.argsort(np.abs(poles))]
+        slow = slow[: 1 if slow[0].imag else 2]
         position, current = [], []
         for part in self.parts:
             x = t[part] - t[part[0]]
             decay = np.exp(np.outer(x, slow))
-            free = np.column_stack((np.ones_like(x), x, decay.real, decay.imag))
+            if slow[0].imag:  # that of a pair which is a little off, too
+                decay = np.column_stack((decay, x[:, np.newaxis] * decay))
+            fading = decay.real, decay.imag[:, np.any(decay.imag, axis=0)]
+            free = np.column_stack((np.ones_like(x), x, *fading))
             position.append((free, np.interp(t[part], self.grid, angle), record.position_rad[part]))
             then = t[part] - p[4]
-            free = np.column_stack((np.ones_like(x), np.interp(then, self.grid, speed), decay.real, decay.imag))
+            free = np.column_stack((np.ones_like(x), np.interp(then, self.grid, speed), *fading))
             current.append((free, np.interp(then, self.grid, acceleration), record.current_a[part]))
         rest_position, follows = _projected(position, 1.0)
         rest_current, amps = _projected(current)
@@ -302,7 +307,7 @@ def fit_speed_loop(
     if first is not None:
         known = [math.log(first.K_p_per_J), math.log(first.K_i_per_J), math.log(first.lag_s), first.late_s, 0.0]
         firsts = [np.array(known) - np.array([0.0, smaller, 0.0, 0.0, 0.0]) for smaller in (0.0, math.log(2.0))]
-    tried = [_solve(model, start, (1.0, 1.0)) for start in firsts]
+    tried = [_solve(model, start, (1.0, 1.0), ROUGHLY) for start in firsts]
     plain = min(tried, key=lambda found: float(np.sum(np.square(_weighted(model, found, (1.0, 1.0))))))
     parts = model.fitted(plain)[:2]
     weights = tuple(max(1.0, float(np.sqrt(np.mean(part**2)))) for part in parts)
@@ -332,7 +337,7 @@ def _weighted(model: _Model, p: Array, weights: Sequence[float]) -> Array:
     return np.asarray(np.clip(np.nan_to_num(found, nan=MOST_LEFT), -MOST_LEFT, MOST_LEFT))
 
 
-def _solve(model: _Model, first: Array, weights: Sequence[float]) -> Array:
+def _solve(model: _Model, first: Array, weights: Sequence[float], ftol: float = 1e-8) -> Array:
     """Return the parameters of least squares."""
     from scipy.optimize import least_squares
 
@@ -341,6 +346,6 @@ def _solve(model: _Model, first: Array, weights: Sequence[float]) -> Array:
     start = np.clip(first, low + 1e-9, high - 1e-9)
     found = least_squares(
         lambda p: _weighted(model, p, weights), start, bounds=(low, high), x_scale=_STEPS,
-        diff_step=1e-4, max_nfev=30,
+        diff_step=1e-4, max_nfev=30, ftol=ftol,
     )  # fmt: skip
     return np.asarray(found.x, dtype=np.float64)
