@@ -27,6 +27,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Tests start some hundred programs; without stored bytecode each compiles the package again, for a second.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+from pmsmtool.bus.clock import PutOff
 from tests import wall_clock
 
 # And every worker compiles all tests, for 8 s.
@@ -38,8 +39,8 @@ os.fsync = lambda descriptor: None
 
 # A background job of a shell without job control ignores SIGINT and hands that on to its children; tests of Ctrl-C
 # would wait for ever. A handler of ours is back to the default in children.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, signal.default_int_handler):
+    signal.signal(signal.SIGINT, PutOff(signal.default_int_handler))  # as the program does
 
 # Before 3.11.8 two threads must not parse at once (python/cpython#106905: SystemError "AST constructor recursion depth
 # mismatch"): pytest does for the source of a failure, and `traceback` for what a server's thread logs meanwhile. The

@@ -30,6 +30,7 @@ _SIGINT = int(signal.SIGINT)
 _signal: Any = importlib.import_module("_signal")
 # The module behind ``signal``: its enum conversions would cost a third of the time of a frame.
 _set_handler: Any = _signal.signal
+_handler: Any = _signal.getsignal
 _pop, _push = heapq.heappop, heapq.heappush
 _thread = threading.get_ident
 
@@ -105,6 +106,40 @@ class Timer:
         self.action = None
 
 
+class _Interrupts:
+    """The main thread's Ctrl-C: how many virtual clocks it holds, and the signal that waits until it holds none."""
+
+    __slots__ = ("depth", "pending", "previous", "replaced")
+
+    def __init__(self) -> None:
+        self.depth = self.pending = 0
+        self.previous: Any = None
+        self.replaced = False
+
+    def remember(self, number: int, frame: FrameType | None) -> None:
+        self.pending = number
+
+
+_interrupts = _Interrupts()
+
+
+class PutOff:
+    """A handler of SIGINT that waits itself until no virtual clock is held: none need be set for every frame.
+
+    Two system calls per frame were a tenth of a read.
+    """
+
+    def __init__(self, handler: Callable[[int, FrameType | None], object]) -> None:
+        self._handler = handler
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        """Take the signal."""
+        if _interrupts.depth:
+            _interrupts.pending = number
+        else:
+            self._handler(number, frame)
+
+
 class _Held:
     """Context of a virtual clock: its lock, and Ctrl-C put off until the simulated world is consistent again.
 
@@ -112,23 +147,17 @@ class _Held:
     Other signals that end a program are put off, too, where their handlers ask the one of SIGINT (``cli.main``).
     """
 
-    __slots__ = ("_depth", "_lock", "_pending", "_previous")
+    __slots__ = ("_lock",)
 
     def __init__(self, lock: threading.RLock) -> None:
         self._lock = lock
-        self._depth = 0
-        self._pending = 0
-        self._previous: Any = None
-
-    def _remember(self, number: int, frame: FrameType | None) -> None:
-        self._pending = number
 
     def __enter__(self) -> None:
         if _thread() == _MAIN_THREAD:
-            if self._depth == 0:
+            if _interrupts.depth == 0 and type(_handler(_SIGINT)) is not PutOff:
                 # First the handler, then the lock: an interrupt in between leaves neither behind.
-                self._previous = _set_handler(_SIGINT, self._remember)
-            self._depth += 1
+                _interrupts.previous, _interrupts.replaced = _set_handler(_SIGINT, _interrupts.remember), True
+            _interrupts.depth += 1
         self._lock.acquire()
 
     def __exit__(
@@ -136,12 +165,13 @@ class _Held:
     ) -> None:
         self._lock.release()
         if _thread() == _MAIN_THREAD:
-            self._depth -= 1
-            if self._depth == 0:
-                previous = self._previous
-                _set_handler(_SIGINT, _signal.SIG_DFL if previous is None else previous)
-                if self._pending:
-                    number, self._pending = self._pending, 0
+            _interrupts.depth -= 1
+            if _interrupts.depth == 0:
+                if _interrupts.replaced:
+                    previous, _interrupts.replaced = _interrupts.previous, False
+                    _set_handler(_SIGINT, _signal.SIG_DFL if previous is None else previous)
+                if _interrupts.pending:
+                    number, _interrupts.pending = _interrupts.pending, 0
                     _signal.raise_signal(number)
 
 

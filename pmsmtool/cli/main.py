@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import click
 
 from pmsmtool import __version__
+from pmsmtool.bus.clock import PutOff
 from pmsmtool.cli.command_table import COMPLETE_VARIABLE, LazyGroup
 from pmsmtool.cli.options import VERBOSITY, examples, global_options
 from pmsmtool.cli.output import show
@@ -310,4 +311,6 @@ def main() -> None:
     for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), _interrupt)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, PutOff(signal.default_int_handler))
     sys.exit(run(sys.argv[1:]))

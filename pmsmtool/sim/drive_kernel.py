@@ -211,8 +211,9 @@ class KernelCore:
     def excitation_state(self) -> ExcitationState:
         """Return the state; a start or stop that the next period takes over counts as taken."""
         out = self.simulation.excitation
-        pending = {STOP: ExcitationState.IDLE, START: ExcitationState.RUNNING}.get(out.command)
-        return ExcitationState(out.state) if pending is None else pending
+        if out.command == START:
+            return ExcitationState.RUNNING
+        return ExcitationState.IDLE if out.command == STOP else ExcitationState(out.state)
 
     # ---- recorder ------------------------------------------------------------------------------------------
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from pmsmtool.bus.clock import NEVER, NS, VirtualClock, WallClock, clock_of
+from pmsmtool.bus.clock import NEVER, NS, PutOff, VirtualClock, WallClock, clock_of
 from pmsmtool.cli.main import _interrupt as end_by_system
 
 pytestmark = pytest.mark.wall_clock
@@ -79,7 +79,8 @@ def test_an_action_cannot_wait_for_the_clock() -> None:
         clock.wait(1.0)
 
 
-def test_ctrl_c_is_put_off_until_the_action_is_complete() -> None:
+@pytest.mark.parametrize("handler", [signal.default_int_handler, PutOff(signal.default_int_handler)])
+def test_ctrl_c_is_put_off_until_the_action_is_complete(handler: Any) -> None:
     clock = VirtualClock()
     steps: list[str] = []
 
@@ -90,16 +91,22 @@ def test_ctrl_c_is_put_off_until_the_action_is_complete() -> None:
 
     clock.at(10, action)
     clock.at(20, lambda: steps.append("later"))
-    with pytest.raises(KeyboardInterrupt):
-        clock.wait(1.0)
-    assert steps == ["begun", "complete"]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    previous = signal.signal(signal.SIGINT, handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            clock.wait(1.0)
+        assert steps == ["begun", "complete"]
+        assert signal.getsignal(signal.SIGINT) is handler
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, previous)
     clock.wait(1.0)
     assert steps == ["begun", "complete", "later"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-@pytest.mark.parametrize("keyboard", [signal.default_int_handler, signal.SIG_IGN])
+@pytest.mark.parametrize("keyboard", [signal.default_int_handler, signal.SIG_IGN, PutOff(signal.default_int_handler)])
 def test_the_program_is_ended_by_the_system_after_the_action(number: signal.Signals, keyboard: Any) -> None:
     """A simulated node that was left in the middle of a frame hung the tool; SIGINT is ignored in background jobs."""
     clock = VirtualClock()

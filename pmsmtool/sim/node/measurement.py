@@ -216,7 +216,7 @@ class Measurement:
 
     def attend(self) -> None:
         """Look after what the core has finished or aborted."""
-        if self._plant.core.excitation_state() is ExcitationState.ABORTED and self._power.state.energised:
+        if self._power.state.energised and self._plant.core.excitation_state() is ExcitationState.ABORTED:
             self._power.fail(EXCITATION_ABORTED)
 
     # ---- recorder ------------------------------------------------------------------------------

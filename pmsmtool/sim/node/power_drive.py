@@ -171,25 +171,26 @@ class PowerDrive:
 
     def statusword(self) -> int:
         """Return the statusword."""
-        word = Status(self.state) | Status.REMOTE
+        word = int(self.state) | int(Status.REMOTE)  # plain numbers: it is what a drive is asked for most
         if self._signal(Signal.U_DC) >= self._plant.parameter("protection.U_dc_min_v"):
-            word |= Status.VOLTAGE_ENABLED
+            word |= int(Status.VOLTAGE_ENABLED)
         if self.state is State.OPERATION_ENABLED:
             if int(self._signal(Signal.FLAGS)) & _LIMIT_FLAGS:
-                word |= Status.INTERNAL_LIMIT
-            word |= self._mode_bits()
-        return int(word)
+                word |= int(Status.INTERNAL_LIMIT)
+            word |= int(self._mode_bits())
+        return word
 
     def _mode_bits(self) -> Status:
-        if self.mode in _SPEED_MODES:
+        mode = self.mode
+        if mode in _SPEED_MODES:
             omega = self.omega_m()
             reached = abs(omega - self._target_speed()) <= self._standstill_rad_s()
             bits = Status.TARGET_REACHED if reached else Status(0)
             return bits | (Status.SPEED_ZERO if abs(omega) <= self._standstill_rad_s() else Status(0))
-        if self.mode in _TORQUE_MODES:
+        if mode in _TORQUE_MODES:
             target = self._target_torque()
             return Status.TARGET_REACHED if self._torque_demand == target else Status(0)
-        return self._position.status() if self.mode in _POSITION_MODES else Status(0)
+        return self._position.status() if mode in _POSITION_MODES else Status(0)
 
     # ---- state machine -------------------------------------------------------------------------
 
