@@ -283,7 +283,7 @@ def _within(objects: MakersObjects, set_up: SetUp) -> SetUp:
 def _pass_on(dictionary: Dictionary, shown: Entry, inner: Entry) -> None:
     """Let a maker's object be the application's own, number for number."""
     if shown.readable and inner.source is not None:
-        shown.source = lambda: shown.encode(inner.number())
+        shown.shows(inner.number)
         if not shown.writable:
             return
     if inner.writable and shown.writable:
@@ -297,7 +297,7 @@ def _pass_on(dictionary: Dictionary, shown: Entry, inner: Entry) -> None:
 def _obey(law: Law, entry: Entry, behind: Behind) -> None:
     show, act = law.show, law.act
     if show is not None:
-        entry.source = lambda: entry.encode(show(behind))
+        entry.shows(lambda: show(behind))
     if act is not None:
         entry.sink = _taken(entry, lambda number: bool(act(behind, number)))
         if law.set_up is not None or law.index in HELD:
@@ -309,8 +309,7 @@ def _taken(entry: Entry, act: Callable[[float], object]) -> Callable[[bytes], No
     def sink(data: bytes) -> None:
         before, entry.value = entry.value, bytes(data)
         try:
-            number = 0.0 if entry.code is None else float(entry.code.unpack(data)[0])
-            act(number)
+            act(float(entry.decode(data)))
         except Refused:
             entry.value = before
             raise

@@ -129,7 +129,7 @@ class PositionLoop:
         except Refused:  # the drive has no such object
             return
         if entry.code is not None:  # a file may make it a text
-            entry.source = lambda: entry.encode(value())
+            entry.shows(value)
 
     def _count(self, turns: float) -> float:
         half = WORD_TURNS // 2

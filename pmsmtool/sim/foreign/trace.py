@@ -39,11 +39,11 @@ class RowTrace:
         self._period.put(1)
         self._running, self._rows = False, b""
         if objects.has((0x2500, 0)):
-            _show(find(0x2500, 0), lambda: len(self._channels))
-        _show(find(0x2501, 0), lambda: 3 * self._runs())
-        _show(find(0x2502, 0), lambda: self._plant.core.period_ns)
-        _show(find(0x2503, 0), lambda: 0 if self._runs() else len(self._rows) // (4 * max(1, len(self._chosen()))))
-        _show(find(0x2504, 0), self._most)
+            find(0x2500, 0).shows(lambda: len(self._channels))
+        find(0x2501, 0).shows(lambda: 3 * self._runs())
+        find(0x2502, 0).shows(lambda: self._plant.core.period_ns)
+        find(0x2503, 0).shows(lambda: 0 if self._runs() else len(self._rows) // (4 * max(1, len(self._chosen()))))
+        find(0x2504, 0).shows(self._most)
         find(0x2508, 0).sink = self._command
         find(0x2509, 0).source = lambda: b"" if self._runs() else self._rows
         for entry in self._channels:
@@ -89,7 +89,3 @@ class RowTrace:
             counts = (round(scales[k % len(scales)] * value) for k, value in enumerate(values))
             self._rows, self._running = struct.pack(f"<{len(values)}i", *counts), False
         return self._running
-
-
-def _show(entry: Entry, value: Callable[[], int]) -> None:
-    entry.source = lambda: entry.encode(value())

@@ -45,7 +45,7 @@ class Entry:
         The application's hooks for reading and writing.
     """
 
-    def __init__(self, row: ObjectRow, node: int) -> None:
+    def __init__(self, row: ObjectRow, node: int = 0) -> None:
         self.row = row
         kind = row.data_type
         self.size = kind.size
@@ -73,12 +73,19 @@ class Entry:
         """Return the bytes of the value."""
         return self.value if self.source is None else self.source()
 
+    def shows(self, value: Callable[[], float]) -> None:
+        """Let a number of the application be read."""
+        self.source = lambda: self.encode(value())
+
     def number(self) -> float:
         """Return the value as a number."""
         if self.code is None:
             raise TypeError(f"{self.row.key} is not a number")
-        value: float = self.code.unpack(self.read())[0]
-        return value
+        return self.decode(self.read())
+
+    def decode(self, data: bytes) -> float:
+        """Return the number that bytes of this type are; 0 where it has no number."""
+        return 0.0 if self.code is None else self.code.unpack(data)[0]
 
     def integer(self) -> int:
         """Return the value of an integer type."""
@@ -130,7 +137,7 @@ def _held_as(code: struct.Struct | None, bound: float | None) -> float | None:
 
 @cache
 def _entries_of_rows() -> dict[int, Entry]:
-    return {row.index << 8 | row.sub: Entry(row, 0) for row in object_rows()}
+    return {row.index << 8 | row.sub: Entry(row) for row in object_rows()}
 
 
 class Dictionary:

@@ -151,7 +151,7 @@ class Face:
             dictionary.hide(index)
         if 0x1016 in hidden:
             for index, wire, name in GUARDING:
-                dictionary.show(Entry(_row(index, 0, wire, name, "rw", "0", True), 0))
+                dictionary.show(_entry(index, 0, wire, name, "rw", "0", True))
         if 0x6007 in hidden:  # a lost master is a fault then, and takes the voltage away
             dictionary["cia402.abort_connection"].put(1)
             if 0x605E in hidden:
@@ -233,8 +233,8 @@ def _modes(
     every choice.
     """
     inner = dictionary["cia402.mode"]
-    shown = Entry(_row(0x6060, 0, "INTEGER8", "Modes of operation", "rw", "R", True), 0)
-    display = Entry(_row(0x6061, 0, "INTEGER8", "Modes of operation display", "ro", "T", False), 0)
+    shown = _entry(0x6060, 0, "INTEGER8", "Modes of operation", "rw", "R", True)
+    display = _entry(0x6061, 0, "INTEGER8", "Modes of operation display", "ro", "T", False)
 
     def sink(data: bytes) -> None:
         mode = int.from_bytes(data, "little", signed=True)
@@ -255,8 +255,8 @@ def _modes(
 
 def _commutation(mode: Entry, dictionary: Dictionary) -> Iterator[Entry]:
     """Yield 0x60EA, and a target torque that is a current at that angle while mode 11 is chosen."""
-    angle = Entry(_row(COMMUTATION_ANGLE, 0, "UNSIGNED16", "Commutation angle", "rw", "R", False), 0)
-    torque = Entry(_row(0x6071, 0, "INTEGER16", "Target torque", "rw", "R", False), 0)
+    angle = _entry(COMMUTATION_ANGLE, 0, "UNSIGNED16", "Commutation angle", "rw", "R", False)
+    torque = _entry(0x6071, 0, "INTEGER16", "Target torque", "rw", "R", False)
     fixed, current = dictionary["set_point.fixed_angle_rad"], dictionary["set_point.i_q_a"]
     own = dictionary["cia402.target_torque"]
 
@@ -302,8 +302,8 @@ class _Parameters:
             if cell.index in STANDARD and self._has(cell) and cell.name not in PROFILE:
                 continue  # works as the standard says, for every family
             parameter = BY_NAME[cell.name]
-            row = _row(cell.index, cell.sub, cell.wire, parameter.meaning, "rw", "R" if parameter.live else "0", True)
-            entry = Entry(row, 0)
+            pdo = "R" if parameter.live else "0"
+            entry = _entry(cell.index, cell.sub, cell.wire, parameter.meaning, "rw", pdo, True)
             entry.value = b""  # not taken from the factory's set yet
             entry.source, entry.sink = self._source(cell), self._sink(cell)
             self._shown[cell.name] = entry
@@ -397,7 +397,7 @@ def _motion_entry(name: str, row: MotionObject, dictionary: Dictionary) -> Entry
     Amperes that no source says to be peak or rms are rms, as those of the rated current; torque counts as current.
     """
     takes = name in ("rated_current", "current_limit", "target_current")
-    entry = Entry(_row(row.index, row.sub, row.wire, name, "rw" if takes else "ro", "R" if takes else "T", False), 0)
+    entry = _entry(row.index, row.sub, row.wire, name, "rw" if takes else "ro", "R" if takes else "T", False)
     base, rated = dictionary[BEHIND[name]], dictionary["cia402.rated_current"]
 
     def per_count() -> float:
@@ -409,8 +409,7 @@ def _motion_entry(name: str, row: MotionObject, dictionary: Dictionary) -> Entry
     kept: dict[bytes, bytes] = {}
 
     def sink(data: bytes) -> None:
-        number = entry.code.unpack(data)[0] if entry.code is not None else 0.0
-        dictionary.write(base, base.encode(number * row.per_count / per_count()))
+        dictionary.write(base, base.encode(entry.decode(data) * row.per_count / per_count()))
         kept.clear()
         kept[base.value] = bytes(data)
 
@@ -430,19 +429,17 @@ def _signal_entry(name: str, signal: SignalCell, dictionary: Dictionary) -> Entr
     """Return the entry of a live quantity or a reference in the family's counts."""
     unit = wire_unit(signal.unit)
     target = name.startswith("target_")
-    row = _row(signal.index, signal.sub, signal.wire, name, "rw" if target else "ro", "R" if target else "T", False)
-    entry = Entry(row, 0)
+    entry = _entry(signal.index, signal.sub, signal.wire, name, "rw" if target else "ro", "R" if target else "T", False)
 
     def scale() -> float:
         return _scale(unit, dictionary)
 
-    entry.source = lambda: entry.encode(_quantity(name, dictionary) / scale())
+    entry.shows(lambda: _quantity(name, dictionary) / scale())
     if target:
 
         def sink(data: bytes) -> None:
             inner, per_count = _target(name, dictionary)
-            value = entry.code.unpack(data)[0] if entry.code is not None else 0.0
-            dictionary.write(inner, inner.encode(value * scale() / per_count))
+            dictionary.write(inner, inner.encode(entry.decode(data) * scale() / per_count))
 
         entry.sink = sink
     return entry
@@ -475,5 +472,5 @@ def _target(name: str, dictionary: Dictionary) -> tuple[Entry, float]:
     return dictionary["cia402.target_velocity"], RAD_S_PER_MRPM
 
 
-def _row(index: int, sub: int, wire: str, name: str, access: str, pdo: str, stored: bool) -> ObjectRow:
-    return ObjectRow(index, sub, "", name, SHORT[wire], access, pdo, "", "0", None, None, stored)
+def _entry(index: int, sub: int, wire: str, name: str, access: str, pdo: str, stored: bool) -> Entry:
+    return Entry(ObjectRow(index, sub, "", name, SHORT[wire], access, pdo, default="0", stored=stored))

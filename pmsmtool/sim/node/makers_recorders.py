@@ -329,8 +329,7 @@ def _channel(k: int) -> Address:
 
 def _trigger_entry() -> Entry:
     """Return the trigger: kept, and without effect, since only "none" is what a caller can rely on."""
-    row = ObjectRow(copley.TRIGGER, 0, "", "Trigger", "DOMAIN", "rw", "0", "", "", None, None, False)
-    entry = Entry(row, 0)
+    entry = Entry(ObjectRow(copley.TRIGGER, 0, "", "Trigger", "DOMAIN", "rw"))
 
     def sink(data: bytes) -> None:
         if len(data) != len(copley.NO_TRIGGER):

@@ -19,7 +19,7 @@ import math
 import struct
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -47,12 +47,12 @@ class ObjectRow:
     name: str
     type: str
     access: str
-    pdo: str
-    unit: str
-    default: str
-    low: float | None
-    high: float | None
-    stored: bool
+    pdo: str = "0"
+    unit: str = ""
+    default: str = ""
+    low: float | None = None
+    high: float | None = None
+    stored: bool = False
     container: str = ""
     parameter: Parameter | None = None
     copied: bool = True
@@ -126,7 +126,6 @@ def _parameter_row(parameter: Parameter) -> ObjectRow:
         default=default,
         low=parameter.minimum,
         high=parameter.maximum,
-        stored=False,
         parameter=parameter,
     )
 
@@ -159,19 +158,12 @@ def build_rows(path: Path) -> tuple[ObjectRow, ...]:
         if (row.index, row.sub) in filled:
             raise ValueError(f"{path}: object 0x{row.index:04X}:{row.sub:02X} appears twice")
         if row.container and row.access == "const":
-            row = _with_default(row, highest[row.index])
+            row = replace(row, default=str(highest[row.index]))
         filled[row.index, row.sub] = row
     for index, sub in filled:
         if (index, 0) not in filled:
             raise ValueError(f"{path}: object 0x{index:04X}:{sub:02X} has no sub-index 0")
     return tuple(filled[key] for key in sorted(filled))
-
-
-def _with_default(row: ObjectRow, highest: int) -> ObjectRow:
-    return ObjectRow(
-        row.index, row.sub, row.key, row.name, row.type, row.access, row.pdo, row.unit,
-        str(highest), row.low, row.high, row.stored, row.container,
-    )  # fmt: skip
 
 
 FILE_NAME = "pmsmsim.eds"

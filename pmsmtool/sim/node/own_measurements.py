@@ -280,15 +280,15 @@ class OsCommands:
         self._began_ns = 0
         self._answer = bytes(COMMAND_BYTES)
         self._unread = False
-        self._mode = Entry(_row(OS_COMMAND_MODE, 0, "U8", "rw", "0"), 0)
+        self._mode = _entry(OS_COMMAND_MODE, 0, "U8", "rw", "0")
         self._mode.sink = self._write_mode
-        self._command = Entry(_row(OS_COMMAND, 1, "DOMAIN", "rw"), 0)
+        self._command = _entry(OS_COMMAND, 1, "DOMAIN", "rw")
         self._command.value, self._command.sink = bytes(COMMAND_BYTES), self._take
-        status = Entry(_row(OS_COMMAND, 2, "U8", "ro", "0"), 0)
+        status = _entry(OS_COMMAND, 2, "U8", "ro", "0")
         status.source = lambda: self._shown()[:1]
-        answer = Entry(_row(OS_COMMAND, 3, "DOMAIN", "ro"), 0)
+        answer = _entry(OS_COMMAND, 3, "DOMAIN", "ro")
         answer.source = self._fetch
-        for entry in (Entry(_row(OS_COMMAND, 0, "U8", "ro", "3"), 0), self._command, status, answer, self._mode):
+        for entry in (_entry(OS_COMMAND, 0, "U8", "ro", "3"), self._command, status, answer, self._mode):
             dictionary.show(entry)
 
     # ---- the objects ----------------------------------------------------------------------------
@@ -391,5 +391,5 @@ class OsCommands:
             raise MeasurementFailed(GIVEN_UP) from error
 
 
-def _row(index: int, sub: int, kind: str, access: str, default: str = "") -> ObjectRow:
-    return ObjectRow(index, sub, "", "Own identification", kind, access, "0", "", default, None, None, False)
+def _entry(index: int, sub: int, kind: str, access: str, default: str = "") -> Entry:
+    return Entry(ObjectRow(index, sub, "", "Own identification", kind, access, default=default))

@@ -28,7 +28,7 @@ from pmsmtool.firmware.image import (
 )
 from pmsmtool.params.catalogue import BY_NAME, CATALOGUE, LUT_CAPACITY_WORDS, SATURATION_VALUES, Parameter
 from pmsmtool.params.parameter_set import SATURATION, to_binary32
-from pmsmtool.sim.node.dictionary import Dictionary, Entry, Refused
+from pmsmtool.sim.node.dictionary import Dictionary, Refused
 
 LUT_PARTS = ("lut.axis_x", "lut.axis_y", "lut.axis_z", "lut.table_i_d", "lut.table_i_q")
 """Keys of the look-up DOMAIN objects."""
@@ -216,18 +216,10 @@ class ParameterSet:
         entries["parameter_set.image"].source = lambda: self._shown().pack()
         entries["parameter_set.image"].sink = self._write_image
         entries["parameter_set.command"].sink = self._command
-        for key, value in (
-            ("crc_active", lambda: self.active_crc),
-            ("crc_stored", lambda: self.stored_crc),
-            ("state", lambda: self.state),
-            ("first_offender", lambda: self._offender),
-        ):
-            entry = entries[f"parameter_set.{key}"]
-            entry.source = self._number_source(entry, value)
-
-    @staticmethod
-    def _number_source(entry: Entry, value: Callable[[], int]) -> Callable[[], bytes]:
-        return lambda: entry.encode(value())
+        entries["parameter_set.crc_active"].shows(lambda: self.active_crc)
+        entries["parameter_set.crc_stored"].shows(lambda: self.stored_crc)
+        entries["parameter_set.state"].shows(lambda: self.state)
+        entries["parameter_set.first_offender"].shows(lambda: self._offender)
 
     def _parameter_source(self, row: Parameter, size: int) -> Callable[[], bytes]:
         return lambda: (self.staging or self.active).wire(row, size)

@@ -18,7 +18,7 @@ TOO_SHORT = 0x8210
 EVENT_TIMER = 5
 """Sub-index of the time within which a receive PDO is expected; the reference drive's have none."""
 DUMMY_BYTE = 0x0005_0008
-DUMMY_ROW = ObjectRow(5, 0, "", "dummy UNSIGNED8", "U8", "wo", "R", "", "", None, None, False)
+DUMMY_ROW = ObjectRow(5, 0, "", "dummy UNSIGNED8", "U8", "wo", "R")
 """What is received and thrown away (CiA 301, 7.5.2.36)."""
 _OFF = 1 << 31
 _SYNC_TYPES = range(1, 241)
@@ -132,7 +132,7 @@ class ProcessData:
 
     def _mapped(self, pdo: _Pdo, word: int) -> tuple[Entry, int]:
         if pdo.name.startswith("rpdo") and word == DUMMY_BYTE:
-            return Entry(DUMMY_ROW, 0), 1
+            return Entry(DUMMY_ROW), 1
         entry = self._dictionary.find(word >> 16, word >> 8 & 0xFF)
         row = entry.row
         direction = "R" if pdo.name.startswith("rpdo") else "T"

@@ -148,13 +148,10 @@ class PositionModes:
         dictionary["cia402.homing_method"].sink = self._write_method
         self._hook("target_position", Mode.CYCLIC_POSITION)
         self._hook("interpolated_position", Mode.INTERPOLATED_POSITION)
-        for key, value in (
-            ("position", lambda state: state.actual),
-            ("position_demand", lambda state: state.demand),
-            ("following_error", lambda state: round(state.error)),
-            ("inputs", lambda state: state.limits),
-        ):
-            self._show(key, value)
+        dictionary["cia402.position"].shows(lambda: self.state().actual)
+        dictionary["cia402.position_demand"].shows(lambda: self.state().demand)
+        dictionary["cia402.following_error"].shows(lambda: self.state().error)
+        dictionary["cia402.inputs"].shows(lambda: self.state().limits)
 
     def _hook(self, key: str, mode: Mode) -> None:
         entry = self._dictionary[f"cia402.{key}"]
@@ -165,10 +162,6 @@ class PositionModes:
                 self._go(entry.integer())
 
         entry.sink = sink
-
-    def _show(self, key: str, value: Callable[[PositionState], int]) -> None:
-        entry = self._dictionary[f"cia402.{key}"]
-        entry.source = lambda: entry.encode(value(self.state()))
 
     def _number(self, key: str) -> float:
         return self._dictionary[f"cia402.{key}"].number()

@@ -122,12 +122,8 @@ class PowerDrive:
             "dc_link": lambda: 1000.0 * self._signal(Signal.U_DC),
         }
         for key, value in sources.items():
-            self._hook_source(f"cia402.{key}", value)
+            entries[f"cia402.{key}"].shows(value)
         entries["cia402.encoder_counts"].put(self._plant.core.encoder_counts)
-
-    def _hook_source(self, key: str, value: Callable[[], float]) -> None:
-        entry = self._dictionary[key]
-        entry.source = lambda: entry.encode(value())
 
     def _reference_sink(self, key: str) -> Callable[[bytes], None]:
         def sink(data: bytes) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Container, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,7 @@ class RecorderFace:
 
     def _register(self, *addresses: Address) -> None:
         for index, sub, letter in addresses:
-            entry = Entry(_row(index, sub, _TYPES[letter]), 0)
+            entry = Entry(ObjectRow(index, sub, "", "Recorder", _TYPES[letter], "rw", default="0"))
             self._entries[index, sub, letter] = entry
             self._dictionary.show(entry)
 
@@ -60,9 +61,9 @@ class RecorderFace:
         """Make a register that shows a number of the recorder's own."""
         self._register(address)
         entry = self._entries[address]
-        entry.row = _row(address[0], address[1], entry.row.type, "ro")
+        entry.row = replace(entry.row, access="ro")
         entry.writable = False
-        entry.source = lambda: entry.encode(value())
+        entry.shows(value)
 
     def _takes(self, address: Address, sink: Callable[[bytes], None], defined: Container[int] | None = None) -> None:
         """Make a register whose writing does something; the sink keeps the bytes where they count.
@@ -85,7 +86,7 @@ class RecorderFace:
 
     def _gives(self, index: int, data: Callable[[], bytes]) -> None:
         """Make a DOMAIN."""
-        entry = Entry(_row(index, 0, "DOMAIN", "ro"), 0)
+        entry = Entry(ObjectRow(index, 0, "", "Recorder", "DOMAIN", "ro"))
         entry.source = data
         self._dictionary.show(entry)
 
@@ -128,8 +129,3 @@ def whole(counts: NDArray[np.float64], kind: str) -> NDArray[np.generic]:
     """Return counts as whole numbers of a type, cut to its range."""
     bounds = np.iinfo(np.dtype(kind))
     return np.clip(np.round(counts), bounds.min, bounds.max).astype(kind)
-
-
-def _row(index: int, sub: int, kind: str, access: str = "rw") -> ObjectRow:
-    default = "0" if kind != "DOMAIN" else ""
-    return ObjectRow(index, sub, "", "Recorder", kind, access, "0", "", default, None, None, False)
