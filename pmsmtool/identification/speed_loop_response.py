@@ -106,7 +106,7 @@ class StepRecord:
         times, values = np.array(self.references).T
         passed = np.concatenate(([0.0], np.cumsum(np.diff(times) * values[:-1])))
         outside = values[0] * np.minimum(t_s - times[0], 0.0) + values[-1] * np.maximum(t_s - times[-1], 0.0)
-        return np.interp(t_s, times, passed) + outside
+        return np.asarray(np.interp(t_s, times, passed) + outside)
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,7 +228,8 @@ class _Model:
 
         poles, residues = self.modes(p)
         reference = self.reference(p[3])
-        driven, speed, acceleration = reference.astype(np.complex128), 0.0, residues.sum().real * reference
+        driven = reference.astype(np.complex128)
+        speed, acceleration = np.zeros_like(reference), residues.sum().real * reference
         for pole, residue in zip(poles, residues, strict=True):
             grown = np.exp(pole * GRID_S)
             answer = lfilter([0.0, residue * (grown - 1.0) / pole], [1.0, -grown], driven)
