@@ -407,21 +407,13 @@ static void add_arcs(pmsm_border *border, const pmsm_plane *plane, double radius
     }
 }
 
-static void add_lines(pmsm_border *border, const pmsm_plane *plane, double radius)
+/* The part of a side of the rectangle that lies in the circle. */
+static void add_line(pmsm_border *border, const pmsm_plane *plane, enum pmsm_curve_kind kind, double level, double low,
+                     double high, double radius)
 {
-    const pmsm_rectangle *r = &border->rectangle;
-    for (int32_t k = 0; k < 2; k++) {
-        const double d = k ? r->d_high : r->d_low, q = k ? r->q_high : r->q_low;
-        if (fabs(d) < radius) {
-            const double reach = sqrt(square(radius) - square(d));
-            add_piece(border, plane, PMSM_CURVE_VERTICAL, d, fmax(-reach, r->q_low), fmin(reach, r->q_high),
-                      EDGE_NODES);
-        }
-        if (fabs(q) < radius) {
-            const double reach = sqrt(square(radius) - square(q));
-            add_piece(border, plane, PMSM_CURVE_HORIZONTAL, q, fmax(-reach, r->d_low), fmin(reach, r->d_high),
-                      EDGE_NODES);
-        }
+    if (fabs(level) < radius) {
+        const double reach = sqrt(square(radius) - square(level));
+        add_piece(border, plane, kind, level, fmax(-reach, low), fmin(reach, high), EDGE_NODES);
     }
 }
 
@@ -432,8 +424,13 @@ void pmsm_border_build(const pmsm_plane *plane, const pmsm_rectangle *rectangle,
     border->n_pieces = 0;
     border->n_nodes = 0;
     add_arcs(border, plane, radius, nodes_per_turn);
-    if (with_lines)
-        add_lines(border, plane, radius);
+    if (with_lines) {
+        const pmsm_rectangle *r = &border->rectangle;
+        add_line(border, plane, PMSM_CURVE_VERTICAL, r->d_low, r->q_low, r->q_high, radius);
+        add_line(border, plane, PMSM_CURVE_HORIZONTAL, r->q_low, r->d_low, r->d_high, radius);
+        add_line(border, plane, PMSM_CURVE_VERTICAL, r->d_high, r->q_low, r->q_high, radius);
+        add_line(border, plane, PMSM_CURVE_HORIZONTAL, r->q_high, r->d_low, r->d_high, radius);
+    }
     for (int32_t k = 0; k < border->n_pieces; k++)
         border->piece[k].curve.rectangle = &border->rectangle;
 }
