@@ -301,7 +301,7 @@ def headroom(machine: MachineParameters, cells: OperatingCells, limits: Headroom
     need = np.where(np.sign(torque) * np.sign(cells.torque_nm) < 0.0, np.inf, need)
     hottest = resistance_at(machine, limits.T_winding_max_c)
     rated = int(np.argmax(cells.torque_nm - 1e-9 * cells.speed_rpm))
-    loss = samples.column("R_s_ohm")[:, 0] * need[:, rated] ** 2 * (R / samples.column("R_s_ohm"))[:, 0]
+    loss = R[:, 0] * need[:, rated] ** 2
     return Headroom(
         1.0 - np.hypot(v_d, v_q) / V_max,
         1.0 - need / limits.I_max_apk,
