@@ -499,9 +499,9 @@ def set_named() -> Iterator[list[Download]]:
     try:
         yield jobs
     except (KeyboardInterrupt, Interrupted) as error:
-        if isinstance(error, Interrupted) and len(jobs) < 2:
-            raise
         several = len(jobs) > 1
+        if isinstance(error, Interrupted) and not several:
+            raise
         held = [f"node {job.node.node}: {job.holds}" if several else job.holds for job in jobs]
         raise Interrupted("; ".join(held) or NOTHING_WRITTEN) from error
 
