@@ -7,9 +7,11 @@ Sigma = s_theta^2 I + s_T^2 G G', G_kj = (k - j - 1/2) T^2/J for j < k (docs/ide
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +28,8 @@ SERIES_BELOW = 1e-3
 """B T/J of an interval below which the way is a series; its next term is 1e-15."""
 DECAY_MOST = 50.0
 """Largest B T/J that is summed up at once."""
+LARGEST_LN_J = 700.0
+"""Above, the exponential function may overflow."""
 SMALLEST_DECAY = 1e-9
 """B T/J below which an interval is a parabola."""
 
@@ -107,43 +111,41 @@ class Problem:
         return SHAFT + int(self.drag) + int(self.runs[0].disturbances.torque.shape[1])
 
     def _off(self, k: int, x: Array) -> Array:
-        """Residual of one trace's positions (rad); not finite where no motion follows: a fit takes that back."""
+        """Residual of one trace's positions (rad), of rows of parameters; NaN where no motion follows."""
         run, first = self.runs[k], self.shared + 2 * k
-        own = x[[*range(SHAFT), first, first + 1]]
-        torque = run.torque - x[SHAFT] * run.square if self.drag else run.torque
+        torque = run.torque - x[:, SHAFT : SHAFT + 1] * run.square if self.drag else run.torque
         shown = run.theta
         if self.shared > self.sizes.start:
-            torque = torque + run.disturbances.torque @ x[self.sizes]
-            shown = shown - run.disturbances.position @ x[self.sizes]
-        try:
-            return positions(torque, run.T, own) - shown
-        except OverflowError:
-            return np.full(len(shown), np.nan)
+            sizes = list(x[:, self.sizes])
+            torque = torque + [run.disturbances.torque @ row for row in sizes]
+            shown = shown - [run.disturbances.position @ row for row in sizes]
+        own = x[:, [*range(SHAFT), first, first + 1]]
+        return _positions_of(np.broadcast_to(torque, (len(x), len(run.torque))), run.T, own) - shown
 
     def residual(self, x: Array) -> Array:
         """Whitened residual of the traces, one after the other, and of the disturbances, shape (n,)."""
-        return np.concatenate([*(factor @ self._off(k, x) for k, factor in enumerate(self.factors)), x[self.sizes]])
+        off = (self._off(k, x[np.newaxis])[0] for k in range(len(self.runs)))
+        return np.concatenate([*(factor @ one for factor, one in zip(self.factors, off, strict=True)), x[self.sizes]])
 
     def jacobian(self, x: Array) -> Array:
         """Its derivative, shape (n, k); one-sided for the disturbances, which hardly bend it."""
         blocks = []
         for k, run in enumerate(self.runs):
             block = np.zeros((len(run.theta), len(x)))
-            here, first = self._off(k, x), self.sizes.start
+            first = self.sizes.start
             if self.shared > first:
                 block[:, self.sizes] = run.disturbances.position
-            turning = [first + int(column) for column in np.nonzero(np.any(run.disturbances.torque, axis=0))[0]]
-            for column in turning:
-                plus = x.copy()
-                plus[column] += self.step[column]
-                block[:, column] = (self._off(k, plus) - here) / (plus[column] - x[column])
             block[:, self.shared + 2 * k] = 1.0  # the first position
-            for column in (*range(first), self.shared + 2 * k + 1):
-                plus, minus = x.copy(), x.copy()
-                plus[column] += self.step[column]
-                minus[column] -= self.step[column]
-                change = self._off(k, plus) - self._off(k, minus)
-                block[:, column] = change / (plus[column] - minus[column])
+            turning = first + np.flatnonzero(np.any(run.disturbances.torque, axis=0))
+            moved = np.array([*turning, *range(first), self.shared + 2 * k + 1])
+            plus, minus = np.tile(x, (2, len(moved), 1))
+            at, same = (np.arange(len(moved)), moved), max(0, len(turning) - 1)
+            plus[at] += self.step[moved]
+            minus[at] -= self.step[moved]
+            minus[: len(turning)] = x  # one of these rows serves all
+            off = self._off(k, np.concatenate([plus, minus[same:]]))
+            change = off[: len(moved)] - off[np.maximum(at[0] - same, 0) + len(moved)]
+            block[:, moved] = (change / (plus[at] - minus[at])[:, np.newaxis]).T
             blocks.append(self.factors[k] @ block)  # one product of matrices instead of one per column and side
         return np.concatenate([*blocks, np.eye(len(x))[self.sizes]])
 
@@ -286,6 +288,29 @@ def positions(torque: Array, T: float, x: Array) -> Array:
     return out
 
 
+def _positions_of(torque: Array, T: float, x: Array) -> Array:
+    """Return :func:`positions` of rows of torques and parameters, NaN where they overflow, shape (k, n + 1).
+
+    All that turn one way throughout at once.
+    """
+    out = np.full((len(x), torque.shape[1] + 1), np.nan)
+    alone = np.ones(len(x), dtype=bool)
+    if len(x) > 1:
+        J = np.array([math.exp(ln_J) if ln_J < LARGEST_LN_J else math.inf for ln_J in x[:, 0].tolist()])
+        decay, omega = x[:, 1] * T / J, x[:, 4]
+        rows = np.flatnonzero(np.isfinite(J) & (omega != 0.0) & (np.abs(decay) * torque.shape[1] <= DECAY_MOST))
+        means = np.array([_means(part) for part in decay[rows].tolist()]).reshape(-1, 2)
+        of_rows = (omega[rows], J[rows], x[rows, 2], decay[rows], means[:, 0], means[:, 1])
+        speed, ways = _one_way(torque[rows], T, *(column[:, np.newaxis] for column in of_rows))
+        out[rows, 0], out[rows, 1:] = x[rows, 3], x[rows, 3:4] + ways
+        alone[rows] = np.any(speed[:, 1:] * np.copysign(1.0, speed[:, :1]) <= 0.0, axis=1)
+    for k in np.flatnonzero(alone):
+        out[k] = np.nan
+        with contextlib.suppress(OverflowError):
+            out[k] = positions(torque[k], T, x[k])
+    return out
+
+
 def _turning(torque: Array, T: float, omega: float, shaft: tuple[float, float, float]) -> tuple[Array, float]:
     """Return ways (rad) to the ends of the intervals before the speed changes its sign, and the speed after them.
 
@@ -294,17 +319,32 @@ def _turning(torque: Array, T: float, omega: float, shaft: tuple[float, float, f
     J, B, tau_c = shaft
     sign, x = math.copysign(1.0, omega), B * T / J
     n = len(torque) if abs(x) * len(torque) <= DECAY_MOST else max(1, int(DECAY_MOST / abs(x)))
-    gone = 1.0 if x == 0.0 else -math.expm1(-x) / x
-    later = 0.5 - x / 6.0 + x * x / 24.0 - x**3 / 120.0 if abs(x) < SERIES_BELOW else (1.0 - gone) / x
-    rate = (torque[:n] - tau_c * sign) / J
-    grown = np.exp(x * np.arange(1.0, n + 1.0))
-    speed = np.empty(n + 1)
-    speed[0] = omega
-    speed[1:] = (omega + np.cumsum(rate * (T * gone) * grown)) / grown
+    speed, ways = _one_way(torque[:n], T, omega, J, tau_c, x, *_means(x))
     turned = np.flatnonzero(speed[1:] * sign <= 0.0)
     n = int(turned[0]) if len(turned) else n
-    ways = np.cumsum(speed[:n] * (T * gone) + rate[:n] * (T * T * later))
-    return np.asarray(ways), float(speed[n])
+    return ways[:n], float(speed[n])
+
+
+def _means(x: float) -> tuple[float, float]:
+    """Return what an interval with a decay of B T/J = x leaves on average: of the first speed, and of the torque."""
+    gone = 1.0 if x == 0.0 else -math.expm1(-x) / x
+    later = 0.5 - x / 6.0 + x * x / 24.0 - x**3 / 120.0 if abs(x) < SERIES_BELOW else (1.0 - gone) / x
+    return gone, later
+
+
+def _one_way(
+    torque: Array, T: float, omega: Any, J: Any, tau_c: Any, x: Any, gone: Any, later: Any
+) -> tuple[Array, Array]:
+    """Return speeds and ways at the ends of intervals while friction has the sign of the first speed.
+
+    Along the last axis; the others are numbers, or columns beside rows of torques.
+    """
+    rate = (torque - tau_c * np.copysign(1.0, omega)) / J
+    grown = np.exp(x * np.arange(1.0, torque.shape[-1] + 1.0))
+    speed = np.empty((*torque.shape[:-1], torque.shape[-1] + 1))
+    speed[..., :1] = omega
+    speed[..., 1:] = (omega + np.cumsum(rate * (T * gone) * grown, axis=-1)) / grown
+    return speed, np.cumsum(speed[..., :-1] * (T * gone) + rate * (T * T * later), axis=-1)
 
 
 def _interval(tau: float, T: float, omega: float, shaft: tuple[float, float, float]) -> tuple[float, float]:
