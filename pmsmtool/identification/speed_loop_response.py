@@ -254,11 +254,10 @@ class _Model:
             decay = np.exp(np.outer(x, slow))
             if slow[0].imag:  # that of a pair which is a little off, too
                 decay = np.column_stack((decay, x[:, np.newaxis] * decay))
-            fading = decay.real, decay.imag[:, np.any(decay.imag, axis=0)]
-            free = np.column_stack((np.ones_like(x), x, *fading))
+            free = np.column_stack((np.ones_like(x), x, decay.real, decay.imag))
             position.append((free, np.interp(t[part], self.grid, angle), record.position_rad[part]))
             then = t[part] - p[4]
-            free = np.column_stack((np.ones_like(x), np.interp(then, self.grid, speed), *fading))
+            free = np.column_stack((np.ones_like(x), np.interp(then, self.grid, speed), decay.real, decay.imag))
             current.append((free, np.interp(then, self.grid, acceleration), record.current_a[part]))
         rest_position, follows = _projected(position, 1.0)
         rest_current, amps = _projected(current)
