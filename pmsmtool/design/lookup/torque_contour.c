@@ -171,7 +171,7 @@ int32_t pmsm_contour_start(const pmsm_contours *all, double T, pmsm_contour *c)
     c->side[0].traced = c->side[1].traced = 0;
     if (!least_current(all, &c->curve, &c->start))
         return 0;
-    if (!(c->start.t_d * c->start.t_d + c->start.t_q * c->start.t_q > 0.0)) {
+    if (!(hypot(c->start.t_d, c->start.t_q) > 0.0)) {
         c->side[0].traced = c->side[1].traced = 1; /* no torque slope: a machine without magnet at rest */
         c->side[0].n = c->side[1].n = 1;
         c->side[0].rising = c->side[1].rising = 1;
