@@ -168,6 +168,10 @@ class ResistanceResult:
     copper: Copper = Copper()
     """What R is taken to another temperature by."""
 
+    def dead_time_s(self, U_dc_v: float, period_s: float) -> float:
+        """Return the dead time that the plateau stands for (s)."""
+        return max(0.0, self.V_dead_v) * period_s / U_dc_v
+
 
 @dataclass(frozen=True, slots=True)
 class _TailFit:

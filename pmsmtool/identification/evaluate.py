@@ -327,9 +327,7 @@ def evaluate(
     flux_map = attempt("map", lambda: flux_map_of(traces, result, tolerance, U_dc_v))
     if flux_map is not None:
         result = replace(result, flux_map=flux_map, map_estimates=map_estimates(result, flux_map, traces))
-    dead_time_s = 0.0
-    if result.resistance is not None and math.isfinite(U_dc_v):
-        dead_time_s = max(0.0, result.resistance.V_dead_v) * period_s / U_dc_v
+    dead_time_s = 0.0 if result.resistance is None else result.resistance.dead_time_s(U_dc_v, period_s)
     shaft = result
     rough_L_h = _rough_inductance(traces, "d"), _rough_inductance(traces, "q")
     pushes = pushes_of(traces, shaft, tolerance, dead_time_s, period_s, rough_L_h)
@@ -474,7 +472,7 @@ def modulation_of(
     U_dc_v = float(speeds.meta.get("U_dc_v", math.inf))
     if not all(L > 0.0 for L in L_h) or not math.isfinite(U_dc_v):
         return None
-    return Modulation(U_dc_v, L_h, period_s, max(0.0, resistance.V_dead_v) * period_s / U_dc_v)
+    return Modulation(U_dc_v, L_h, period_s, resistance.dead_time_s(U_dc_v, period_s))
 
 
 def flux_of(

@@ -141,7 +141,7 @@ def forecast_of(
         resistance.R_measured.value,
         L_q,
         psi,
-        max(0.0, resistance.V_dead_v) * drive.period_s / U_dc_v,
+        resistance.dead_time_s(U_dc_v, drive.period_s),
         pole_pairs,
         drive.read("current.K_p_q_v_per_a") / L_q,
     )

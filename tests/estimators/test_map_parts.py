@@ -266,6 +266,13 @@ def test_the_resistance_of_the_pulses_is_that_of_their_mean_temperature() -> Non
     assert map_result._R_at(found, [_trace(t, i=t)]) == 0.8
 
 
+def test_the_dead_time_is_that_of_the_plateau() -> None:
+    R, curve = Estimate(0.8, 0.01, 0.0, "ohm"), InverterCurve(np.array([1.0]), np.array([0.0]), 0.0)
+    found = ResistanceResult(R, R, curve, 3.0, 0.0, 0.0, Copper())  # type: ignore[arg-type]
+    assert found.dead_time_s(600.0, 1e-4) == pytest.approx(5e-7, rel=EXACT)
+    assert found.dead_time_s(math.inf, 1e-4) == replace(found, V_dead_v=-3.0).dead_time_s(600.0, 1e-4) == 0.0
+
+
 # ---- the regression of a map ------------------------------------------------------------------------------------
 
 

@@ -13,9 +13,10 @@ import pytest
 from numpy.typing import NDArray
 
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
+from pmsmtool.estimators.estimate import SensorTolerance, Verdict, total_half_width
 from pmsmtool.estimators.injection.sampling_instant import Sampling
 from pmsmtool.estimators.inverter_error import InverterCurve
+from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.evaluate import Evaluation
 from pmsmtool.machine.parameters import Estimate
@@ -88,8 +89,9 @@ def identified(runs: list[Trace], measured_dead: float) -> EmfHarmonics:
 
     grid = np.linspace(0.02, 6.0, 120)
     curve = InverterCurve(grid, measured_dead * np.tanh(grid / KNEE), 0.0)
+    resistance = estimate(R, 1e-3, "ohm")
     result = SimpleNamespace(
-        resistance=SimpleNamespace(R_measured=estimate(R, 1e-3, "ohm"), curve=curve, V_dead_v=measured_dead),
+        resistance=ResistanceResult(resistance, resistance, curve, measured_dead, 0.0, Verdict.PASS),
         inductance=SimpleNamespace(L_d=estimate(L_D, 1e-5, "H"), L_q=estimate(L_Q, 1e-5, "H"), sampling=Sampling()),
         flux=SimpleNamespace(psi_measured=estimate(PSI, 1e-4, "Wb")),
         encoder=SimpleNamespace(direction=1, pole_pairs=estimate(POLE_PAIRS, 0.0, "1")),

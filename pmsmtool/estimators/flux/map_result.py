@@ -183,7 +183,7 @@ def estimate_flux_map(
     R_ohm, T_s = _R_at(resistance, traces), float(traces[0].meta["control_period_s"])
     fit = fit_coenergy(
         traces, frame, resistance.curve, R_ohm=R_ohm, sigma_a=noise.sigma_a, magnet=magnet, align=align,
-        legs=(Modulation(U_dc_v, (math.nan, math.nan), T_s, max(0.0, resistance.V_dead_v) * T_s / U_dc_v), sampling)
+        legs=(Modulation(U_dc_v, (math.nan, math.nan), T_s, resistance.dead_time_s(U_dc_v, T_s)), sampling)
         if math.isfinite(U_dc_v) else None,
     )  # fmt: skip
     i_max = max(float(trace.meta["i_max_a"]) for trace in traces)
