@@ -3,6 +3,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -186,6 +187,25 @@ def test_an_old_angle_looks_like_a_late_sample() -> None:
     old = shown_instant(_run(0.0, 0.0, age_s=2e-6), 0.4, 0.1, MODULATION, 1.0)
     assert fresh is not None and old is not None
     assert old.value_s - fresh.value_s == pytest.approx(2e-6, rel=1e-6)
+
+
+def test_a_q_current_that_rises_with_the_speed_shows_no_instant() -> None:
+    rows = _run(0.0, 0.0)
+    i_q = 1e-3 * rows.w
+    driven = replace(rows, i_q=i_q, u_d=rows.u_d - rows.w * L_H[1] * i_q)
+    without, found = (shown_instant(each, 0.4, 0.1, MODULATION, 1.0) for each in (rows, driven))
+    assert without is not None and found is not None
+    assert found.value_s == pytest.approx(without.value_s, abs=1e-9 * T_S)  # measured 8e-17; L_q i_q stands for T_s
+
+
+def test_the_deviation_is_that_of_a_regression_on_eight_pairs() -> None:
+    rows = _run(0.0, 0.0)
+    noise = np.random.default_rng(5).standard_normal(8)
+    shown = shown_instant(replace(rows, u_d=rows.u_d + np.repeat(noise, 2)), 0.4, 0.1, MODULATION, 1.0)
+    columns = np.stack([-0.1 * rows.w[::2] ** 2, rows.w[::2], np.ones(8)], axis=1)
+    squares = np.linalg.lstsq(columns, noise, rcond=None)[1][0]
+    expected = math.sqrt(squares / (8 - 3) * np.linalg.inv(columns.T @ columns)[0, 0])
+    assert shown is not None and shown.std_s == pytest.approx(expected, rel=1e-3)  # measured 1.8e-5: the floor
 
 
 def test_the_prediction_keeps_rising_past_the_end_of_the_zero_vectors() -> None:
