@@ -64,6 +64,13 @@ def test_noise_of_the_sensors_brakes_nothing() -> None:
     assert np.max(np.abs(_harmonic_current(push((0.0, 0.0)), 1, PAIRS, known()))) < 1e-5  # measured 1.2e-6 A
 
 
+def test_a_push_that_moved_nothing_has_no_harmonics() -> None:
+    """A light rotor that cogging held, 60 W: a division by its speed ended the command with exit 70."""
+    trace = push((0.5, 0.2))
+    stood = replace(trace, signals={**trace.signals, "theta_M_rad": np.zeros(ROWS)})
+    assert not np.any(_harmonic_current(stood, 1, PAIRS, known()))
+
+
 def test_the_inverter_drives_its_own_harmonics() -> None:
     """Its error alone, behind R and K_p: 0.65 % of J, which a healthy drive without harmonics would have lost."""
     curve = InverterCurve(np.array([0.5, 1.0]), np.array([2.0, 2.0]), 0.0)
