@@ -148,3 +148,26 @@ def test_friction_hides_no_inertia(friction_a: float) -> None:
     _, psi, J = pushed(0.0, 0.0, 400.0, 500.0, friction_a)
     assert psi == pytest.approx(PSI, rel=BEHIND_FRICTION)
     assert J == pytest.approx(1.5 * POLE_PAIRS * PSI / 400.0, rel=BEHIND_FRICTION)
+
+
+@pytest.mark.parametrize(
+    ("answers", "rate"),
+    [
+        ([(3.54, 1.74e-3), (11.1, 1.75e-3), (20.6, 1.89e-3), (33.9, 2.46e-3)], 30.36 / 0.72e-3),
+        ([(3.54, 1.74e-3)] * 5, 3.54 / 1.74e-3),
+    ],
+)
+def test_a_second_push_in_which_no_more_current_flowed_tells_no_inertia(
+    answers: list[tuple[float, float]], rate: float
+) -> None:
+    """60 W behind cogging (28 000 rad/s2/A): the first two, 0.6 % apart in what flowed, gave 760 000."""
+    pushed_a = []
+
+    class Answering(SpeedStage):
+        def _there_and_back(self, i_q_a: float, seconds: float, pole_pairs: int) -> tuple[float, float]:
+            pushed_a.append(i_q_a)
+            return answers[len(pushed_a) - 1]
+
+    stage = Answering(SimpleNamespace(), LIMITS, lambda name, trace: None, lambda text: None)  # type: ignore[arg-type]
+    assert stage._acceleration_per_ampere(10.0, POLE_PAIRS) == pytest.approx(rate)
+    assert pushed_a == sorted(pushed_a) and pushed_a[-1] <= LIMITS.I_test_apk
