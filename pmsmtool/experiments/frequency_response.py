@@ -2,18 +2,20 @@
 """Random torque on a steady speed: currents and positions for the mechanical frequency response.
 
 The speed keeps its sign, so that Coulomb friction is a constant and the response is linear. A binary sequence on the q
-current moves the shaft; its level is what the limits leave, and what keeps the speed's random walk small.
+current moves the shaft; its sum is bounded, and so is what it adds to the speed: its level is what the limits leave,
+and what keeps that small. Without a bound the speed of a light shaft walked away with a twentieth of the current.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
 from pmsmtool.experiments.signals import readable
-from pmsmtool.experiments.speed_run import reach
+from pmsmtool.experiments.speed_run import REACH_LIMIT_S, reach
 from pmsmtool.trace import Trace
 
 SIGNALS = ("i_d_a", "i_q_a", "theta_m_rad", "flags")
@@ -25,17 +27,22 @@ BIT_RATE_HZ = 2000.0
 """Bits of the sequence per second; it excites evenly up to 0.4 of that."""
 REPEATS = 6
 """Records: their spread is the noise of a line."""
-LEAD_S, LEAD_STEP_S = 0.3, 0.15
-"""Sequence before the first record, and more before each further one: another part of it."""
-WALK_SHARE = 0.1
-"""Standard deviation of the speed's random walk at the end of a record, of the speed."""
+LEAD_S = 0.1
+"""Sequence before a record."""
+BITS, BITS_AHEAD = 2048, 12
+"""Bits of the sequence, which then repeats, and by how many its sum leaves zero: evenly from 5 Hz on."""
+WALK_SHARE = 0.2
+"""Most that the sequence, or an error of the bias within a record, changes the speed by, of the speed."""
 BUS_ALLOWANCE_S = 0.5
 """Time the recorder may be started late; the sequence lasts longer by it."""
 BIAS_SETTLE_S, BIAS_WINDOW_S = 0.1, 0.2
 """Time for which a bias is held, and that in which the change of the speed is then seen (s)."""
-BIAS_TRIES = 6
-"""Times it is corrected by that. A speed controller may shake an elastic shaft at its resonance, and the mean of its
-current is then no bias: with it the shaft stopped in five of six records, and J came out 3.1 to 3.9 % too large."""
+BIAS_TRIES, AGAIN_TRIES = 6, 2
+"""Times it is corrected by that, before the first record and before each further one. A speed controller may shake an
+elastic shaft at its resonance, and the mean of its current is then no bias: with it the shaft stopped in five of six
+records, and J came out 3.1 to 3.9 % too large."""
+AGAIN_S = 1.0
+"""Longest wait for a speed that the shaft had before: with cogging a light one never stays near it, and took 300 s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +61,13 @@ class FrequencyPlan:
     """Rough mechanical acceleration per q current (rad/s2/A)."""
 
     def bias_doubt_a(self, period_s: float) -> float:
-        """Return the error of the bias that changes the speed by :data:`WALK_SHARE` within the longest record (A)."""
-        longest = LEAD_S + (REPEATS - 1) * LEAD_STEP_S + ROWS * self.decimation * period_s
+        """Return the error of the bias that changes the speed by :data:`WALK_SHARE` within a record (A)."""
+        longest = LEAD_S + ROWS * self.decimation * period_s
         return WALK_SHARE * self.omega_rad_s / (self.per_ampere_rad_s2 * longest)
 
     def duration_s(self, period_s: float) -> float:
         """Time of the records with their leads (s)."""
-        leads = sum(LEAD_S + k * LEAD_STEP_S for k in range(REPEATS))
-        return leads + REPEATS * ROWS * self.decimation * period_s
+        return REPEATS * (LEAD_S + ROWS * self.decimation * period_s)
 
 
 def plan_frequency_response(
@@ -84,10 +90,19 @@ def plan_frequency_response(
     """
     decimation = max(1, round(1.0 / (ROW_RATE_HZ * period_s)))
     hold = max(1, round(1.0 / (BIT_RATE_HZ * period_s)))
-    longest = LEAD_S + (REPEATS - 1) * LEAD_STEP_S + ROWS * decimation * period_s
     per_ampere = torque_per_a / J_kgm2
-    level = WALK_SHARE * omega_rad_s / (per_ampere * math.sqrt(longest * hold * period_s))
+    level = WALK_SHARE * omega_rad_s / (per_ampere * BITS_AHEAD * hold * period_s)
     return FrequencyPlan(min(i_q_a, level), omega_rad_s, hold, decimation, per_ampere)
+
+
+def bounded_sequence(k: int) -> list[float]:
+    """Return the signs of record k, shape (BITS,), whose sum starts and ends at zero and is never beyond BITS_AHEAD."""
+    signs, ahead = np.random.default_rng(k).choice([-1.0, 1.0], BITS), 0.0
+    for k, left in enumerate(range(BITS, 0, -1)):
+        if abs(ahead + signs[k]) > min(BITS_AHEAD, left - 1):
+            signs[k] = -signs[k]
+        ahead += signs[k]
+    return [float(sign) for sign in signs]
 
 
 def linear_level(i_q_a: float, room_v: float, K_p_v_per_a: float) -> float:
@@ -117,16 +132,16 @@ def excite_at_speed(
     bias: float | None = None
     for k in range(REPEATS):
         bias = keep_speed(drive, plan, pole_pairs, bias)
-        lead = LEAD_S + k * LEAD_STEP_S
         excitation = Excitation(
-            shape=Shape.PRBS,
+            shape=Shape.BUFFER,
             point=Injection.I_Q,
             amplitude=plan.i_q_a,
+            buffer=[plan.i_q_a * sign for sign in bounded_sequence(k)],
             bias_q_a=bias,
             hold_periods=plan.hold_periods,
-            duration_s=lead + BUS_ALLOWANCE_S + ROWS * plan.decimation * drive.period_s,
+            duration_s=LEAD_S + BUS_ALLOWANCE_S + ROWS * plan.decimation * drive.period_s,
             abort_speed_rad_s=abort_speed_rad_s,
-            lead_s=lead,
+            lead_s=LEAD_S,
         )
         keep(readable(drive.record(SIGNALS, ROWS, decimation=plan.decimation, excitation=excitation)))
     drive.command_speed(0.0)
@@ -138,9 +153,9 @@ def keep_speed(drive: Drive, plan: FrequencyPlan, pole_pairs: int, bias: float |
     ``bias`` is that of the record before; None: the speed controller's mean is the first one.
     """
     half = round(0.5 * BIAS_WINDOW_S / drive.period_s)
-    for _ in range(BIAS_TRIES):
+    for _ in range(BIAS_TRIES if bias is None else AGAIN_TRIES):
         drive.command_speed(plan.omega_rad_s)
-        reach(drive, pole_pairs * plan.omega_rad_s)
+        reach(drive, pole_pairs * plan.omega_rad_s, limit_s=REACH_LIMIT_S if bias is None else AGAIN_S)
         if bias is None:
             bias = drive.average(("i_q_a",), 2 * half)["i_q_a"]
         drive.command_current(0.0, bias)

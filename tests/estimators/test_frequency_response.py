@@ -16,7 +16,16 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR
 from pmsmtool.estimators.shaft.frequency_response import COHERENT, FrequencyResponse, estimate_frequency_response
 from pmsmtool.estimators.shaft.response_lines import counted
-from pmsmtool.experiments.frequency_response import ROWS, WALK_SHARE, linear_level, plan_frequency_response
+from pmsmtool.experiments.frequency_response import (
+    BIT_RATE_HZ,
+    BITS,
+    REPEATS,
+    ROWS,
+    WALK_SHARE,
+    bounded_sequence,
+    linear_level,
+    plan_frequency_response,
+)
 from pmsmtool.trace import Trace
 
 pytestmark = pytest.mark.chain
@@ -343,15 +352,25 @@ def test_what_gives_no_response_is_refused_by_name() -> None:
     assert reason([clipped, *good[1:]]) == "E_CLIPPED"
 
 
-def test_the_sequence_is_sized_by_the_limits_and_the_walk_of_the_speed() -> None:
+def test_the_sequence_is_sized_by_the_limits_and_by_what_it_adds_to_the_speed() -> None:
     heavy = plan_frequency_response(2.0, 30.0, 1.0, PER_A, T_S)
     assert heavy.i_q_a == 2.0 and heavy.decimation == DECIMATION and heavy.hold_periods == HOLD
     light = plan_frequency_response(2.0, 30.0, 1e-4, PER_A, T_S)
     twice = plan_frequency_response(2.0, 60.0, 1e-4, PER_A, T_S)
     assert light.i_q_a < 2.0 and twice.i_q_a == pytest.approx(2.0 * light.i_q_a)
-    longest = 0.3 + 5 * 0.15 + ROWS * DECIMATION * T_S
-    walk = PER_A / 1e-4 * light.i_q_a * math.sqrt(longest * HOLD * T_S)
-    assert walk == pytest.approx(WALK_SHARE * 30.0)
+    added = PER_A / 1e-4 * light.i_q_a * HOLD * T_S * np.cumsum(bounded_sequence(3))
+    assert np.max(np.abs(added)) == pytest.approx(WALK_SHARE * 30.0)
+
+
+def test_the_bounded_sequence_ends_where_it_began_and_excites_from_the_lowest_line() -> None:
+    signs = [np.array(bounded_sequence(k)) for k in range(REPEATS)]
+    assert all(set(s.tolist()) == {-1.0, 1.0} and s.sum() == 0.0 for s in signs)
+    assert not np.array_equal(signs[0], signs[1])
+    power = np.mean([np.abs(np.fft.rfft(s)) ** 2 / BITS for s in signs], axis=0)
+    frequency_hz = np.fft.rfftfreq(BITS, 1.0 / BIT_RATE_HZ)
+    bands = [(5.0, 10.0), (10.0, 30.0), (30.0, 100.0), (100.0, 800.0)]
+    shares = [float(np.mean(power[(frequency_hz >= low) & (frequency_hz < high)])) for low, high in bands]
+    assert min(shares) > 0.5 and max(shares) < 1.5  # measured 0.61 and 1.00
 
 
 def test_a_bit_of_the_sequence_takes_no_more_than_the_voltage() -> None:
