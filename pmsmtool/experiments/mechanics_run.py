@@ -25,6 +25,7 @@ import numpy as np
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
 from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.shaft.mechanics import POWERED
+from pmsmtool.estimators.shaft.position import ENCODER_STEPS_LEAST, encoder_step
 from pmsmtool.experiments.signals import readable
 from pmsmtool.experiments.speed_run import reach
 from pmsmtool.trace import Trace
@@ -162,6 +163,8 @@ LEFT_LEAST = 0.5
 SHORTER = 3.0
 """Current of the pushes of such a shaft, of the planned one, which are shorter by as much: cogging and friction that
 stop it soon are then a third of the push."""
+STEPS_DOUBT = 1.5
+"""Steps of the encoder that such a push is to turn, of the least: a third of 65 of 10 bits were 22, 50 are asked."""
 CURRENT_OFF = 0.15
 """Current, of the push's, below which it is over. What flows then is known, and counts as a torque: a loop whose
 integral follows the falling back-EMF lets 8 % flow on a light shaft until friction has stopped it."""
@@ -239,7 +242,7 @@ def push_and_coast(drive: Drive, plan: MechanicsPlan, abort_speed_rad_s: float, 
         first = _push(drive, plan.i_q_a, plan.unit_s, plan.rows, abort_speed_rad_s)
         coasting = _coast(drive, plan)
     if abs(_speed(coasting, first_rows=True)) < LEFT_LEAST * abs(_speed(first)):
-        times = min(SHORTER, plan.i_most_a / plan.i_q_a)
+        times = max(1.0, min(SHORTER, plan.i_most_a / plan.i_q_a, _seen(first)))
         current, push_s = times * plan.i_q_a, plan.unit_s / times
         for sign in (1.0, -1.0):
             drive.enable()
@@ -257,6 +260,15 @@ def push_and_coast(drive: Drive, plan: MechanicsPlan, abort_speed_rad_s: float, 
     back_s = max(plan.unit_s, plan.unit_s * both / max(reached, 0.1 * plan.omega_rad_s))
     keep(_push(drive, -plan.i_q_a, back_s, plan.rows, abort_speed_rad_s))
     keep(_coast(drive, plan))
+
+
+def _seen(push: Trace) -> float:
+    """Return how many times shorter a push to the same speed may be, of one whose encoder's steps are seen."""
+    theta = push["theta_M_rad"]
+    try:
+        return float(np.ptp(theta)) / (STEPS_DOUBT * ENCODER_STEPS_LEAST * encoder_step([theta]))
+    except IdentificationError:  # it turned by fewer steps
+        return 1.0
 
 
 def _coast(drive: Drive, plan: MechanicsPlan) -> Trace:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.port import Excitation
 from pmsmtool.estimators.estimate import statistical_half_width, total_half_width
 from pmsmtool.estimators.shaft.mechanics import POWERED
+from pmsmtool.estimators.shaft.position import ENCODER_STEPS_LEAST
 from pmsmtool.experiments.mechanics_run import (
     SHORT,
     SHORTER,
@@ -204,3 +206,22 @@ def test_a_shaft_that_stops_before_it_coasts_is_pushed_shorter_and_harder(i_most
     assert drive.pushes[-2:] == pytest.approx([times * 0.2, -times * 0.2])
     assert [len(run) * run.period_s * times for run in kept[0::2]] == pytest.approx([plan.unit_s] * 2, rel=0.02)
     assert [bool(run.meta.get(POWERED)) for run in kept] == [False, True, False, True]
+
+
+def test_a_push_stays_long_enough_for_the_steps_of_a_coarse_encoder() -> None:
+    """A rotor of 65 000 rad/s2 with 10 bits: a third of a push turned 22 steps, 50 are needed, and J was refused."""
+
+    class Coarse(LightShaft):
+        def disable(self) -> None:
+            self.omega = 0.0
+
+        def record(self, *asked: Any, **more: Any) -> Trace:
+            trace, step = super().record(*asked, **more), 2.0 * math.pi / 2**10
+            theta = step * np.floor(trace["theta_m_rad"] / step)
+            return replace(trace, signals={**trace.signals, "theta_m_rad": theta})
+
+    drive, kept = Coarse(1e-2), list[Trace]()
+    push_and_coast(drive, MechanicsPlan(0.2, 0.03, 60.0, 2.0), 1e4, kept.append)  # type: ignore[arg-type]
+    turned = [float(np.ptp(run["theta_M_rad"])) for run in kept[0::2]]
+    assert 0.2 < abs(drive.pushes[-1]) < 0.2 * SHORTER
+    assert min(turned) > ENCODER_STEPS_LEAST * 2.0 * math.pi / 2**10
