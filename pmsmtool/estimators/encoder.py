@@ -36,6 +36,8 @@ COUNTS_SHARE = 0.25
 PER_TURN_LEAST_RAD = 2e-3
 PER_TURN_ORDERS = 8
 """Highest order per turn that shows how much of the following error is no encoder's."""
+PER_TURN_ROWS = 2
+"""Rows of a way, of the numbers that are fitted, from which on it shows an error per turn."""
 PER_TURN_SURE = 4.0
 """Error of the encoder once or twice per turn (mechanical) from which on it is told, and how much more of it both
 directions have in common than they differ by: what a swinging rotor or friction shows differs. Of 22 random drives
@@ -211,6 +213,8 @@ def _per_turn(forward: Trace, backward: Trace, direction: int, pole_pairs: int) 
     """
     p = pole_pairs
     orders = [*ENCODER_ORDERS, *(k for k in range(3, PER_TURN_ORDERS + 1) if p == 1 or k % p)]
+    if min(len(forward), len(backward)) < PER_TURN_ROWS * (1 + 2 * len(orders)):
+        return ()
     found = []
     for trace in (forward, backward):
         theta = direction * trace["theta_M_rad"]

@@ -20,7 +20,7 @@ a half swings, and never more than 7 % beyond.
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,9 +55,9 @@ SWUNG_RAD = math.pi / 3.0
 """Longest turn by one swing."""
 SWING_LOOK_S, SPANS = 0.003, 8
 """Time between two looks at a swing (s), and spans of the looks so far: the last two show the speed of the next one."""
-STUCK_S, SWING_MOST_S = 0.12, 1.5
+STUCK_S, SWING_MOST_S = 0.12, 2.5
 """A rotor that has not moved by then is held by friction, as the current of the slowest loop has come; and the longest
-wait, half a swing of a load of 50 times the rotor's inertia."""
+wait: a load of 26 rotors that needs 100 s to its rated speed has half a swing of 1.9 s."""
 LOOK_S = 0.03
 LOOKS = 4
 """Looks at the encoder over which a shaft at rest does not move: two alone also find the end of a swing at rest."""
@@ -69,6 +69,8 @@ BRAKED_SHARE = 0.25
 """Current while it returns, of that while it leaves: every half swing is half of the one before."""
 BRAKED_S = 20.0
 """Longest braking (s): ten half swings of a load of 50 times the rotor's inertia on the first current (0.7 Hz)."""
+STILL_SHARE = 0.75
+"""Looks that show rest, of those since the shaft was fastest: a swing of 2 degrees is seen at its turning point."""
 SLOW_LOOKS = 4
 """Looks of a half swing from which on it is braked: of a quicker one the looks show too little."""
 
@@ -127,26 +129,32 @@ def come_to_rest(drive: Drive, i_a: float, angle_rad: float, *, limit_s: float =
     a turning point to its largest speed a small current pulls it, from there to the next turning point all of it.
     """
     periods = max(1, round(0.25 * LOOK_S / drive.period_s))
-    seen: deque[float] = deque(maxlen=LOOKS)
-    waited, way, fastest, looks, slow, small = 0.0, 0.0, 0.0, 0, False, False
-    while waited < limit_s and (len(seen) < (seen.maxlen or LOOKS) or max(seen) - min(seen) > REST_SPAN_RAD):
+    seen: list[float] = []
+    waited, way, fastest, fastest_at, shown_at, turned_at, slow, small = 0.0, 0.0, 0.0, 0, 0, 0, False, False
+    while waited < limit_s and not _rests(seen, shown_at):
         drive.wait(LOOK_S)
         waited += LOOK_S
         seen.append(drive.average(("theta_m_rad",), periods)["theta_m_rad"])
         before, way = way, seen[-1] - seen[-2] if len(seen) > 1 else 0.0
         turned = way * before <= 0.0
-        if turned and waited > REST_LIMIT_S:  # the end of a long swing looks like rest
-            seen = deque(seen, max(LOOKS, looks))
-        fastest, looks, slow = (
-            (abs(way), 0, looks >= SLOW_LOOKS) if turned else (max(fastest, abs(way)), looks + 1, slow)
-        )
-        returns = slow and (turned or (small and abs(way) >= fastest))
+        if turned:
+            shown_at = fastest_at if fastest > REST_SPAN_RAD / LOOKS else shown_at
+            slow, turned_at = len(seen) - turned_at > SLOW_LOOKS, len(seen)
+        if turned or abs(way) > fastest:
+            fastest, fastest_at = abs(way), len(seen)
+        returns = slow and (turned or (small and len(seen) == fastest_at))
         if waited > REST_LIMIT_S and returns is not small:
             small = returns
             drive.command_current(i_a * (BRAKED_SHARE if small else 1.0), 0.0, fixed_angle_rad=angle_rad)
     if small:
         drive.command_current(i_a, 0.0, fixed_angle_rad=angle_rad)
     return waited
+
+
+def _rests(seen: Sequence[float], fastest_at: int) -> bool:
+    """Return whether the last looks show rest, most of those since the shaft was fastest: a long swing has an end."""
+    last = seen[-max(LOOKS, int(STILL_SHARE * (len(seen) - fastest_at))) :]
+    return len(seen) >= LOOKS and max(last) - min(last) <= REST_SPAN_RAD
 
 
 def lead_onto_vector(drive: Drive, i_a: float, angle_rad: float) -> None:
@@ -186,6 +194,16 @@ SLOWEST_STEP_S = 0.2
 ROW_S = 0.002
 """Time over which the encoder is averaged after every step."""
 LEAST_RAMP_STEPS = 4
+SLACK_STEPS = 7
+"""Steps before a way in which friction, turned round, holds a rotor that swings back now and then."""
+LINE_ROWS = 5
+"""Rows of a line that shows where a rotor is beside its vector."""
+OFF_MOST_RAD = math.radians(30.0)
+"""Largest angle of that: more is no swing."""
+FASTEST_SWING_RAD_S = 105.0
+"""Of 400 random drives on 0.35 of the test current: a rotor that swings a step is fastest halfway, by half of it."""
+SWINGS_MOST_S = 100.0
+"""Longest way of a rotor that swings from step to step: a turn of eight pole pairs with two seconds per half swing."""
 BACK_LEAST_S = 0.3
 """Shortest turn back to a whole electrical turn; the usual time is that of half a turn."""
 
@@ -198,8 +216,8 @@ class RotationPlan:
     """Length of the vector (A peak)."""
     step_rad: float = STEP_RAD
     """Electrical angle of one step."""
-    dwell_s: float = 0.015
-    """Time per step (s)."""
+    dwell_s: float | None = 0.015
+    """Time per step (s); without one the rotor swings from step to step (:func:`turn_vector`)."""
     turns_mechanical: float = 1.02
     """Mechanical turns in each direction."""
     ramp_s: float = RAMP_S
@@ -208,6 +226,8 @@ class RotationPlan:
     @property
     def ramp(self) -> tuple[float, ...]:
         """Return the steps of the ramp, of a whole step; none is larger, so the shaft keeps to its speed limit."""
+        if self.dwell_s is None:
+            return (1.0,) * SLACK_STEPS
         return rising(max(LEAST_RAMP_STEPS, round(self.ramp_s / (self.dwell_s + ROW_S))))
 
 
@@ -237,14 +257,16 @@ def dwell_within(dwell_s: float, omega_max_rad_s: float) -> float:
     return max(dwell_s, least_s)
 
 
-def step_within(step_rad: float, dwell_s: float, omega_max_rad_s: float) -> tuple[float, float]:
+def step_within(step_rad: float, dwell_s: float | None, omega_max_rad_s: float) -> tuple[float, float | None]:
     """Return angle (rad electrical) and time (s) of a step that keep the shaft to a speed limit.
 
     A limit shortens the step, to half of ``STEP_RAD`` at the least, and then makes it longer in time
-    (:func:`dwell_within`).
+    (:func:`dwell_within`); one that the rotor swings, as far as the limit asks.
 
     Raises IdentificationError: ``E_EXCITATION``, as there.
     """
+    if dwell_s is None:
+        return min(step_rad, 2.0 * omega_max_rad_s / FASTEST_SWING_RAD_S), None
     shorter = min(step_rad, omega_max_rad_s * (dwell_s + ROW_S) / SWING)
     if shorter >= min(step_rad, 0.5 * STEP_RAD):
         return shorter, dwell_s
@@ -273,7 +295,8 @@ def rotate_vector(drive: Drive, plan: RotationPlan, *, start_rad: float = 0.0) -
     come_to_rest(drive, plan.i_a, angle)
     angle, backward = _run(drive, plan, angle, -plan.step_rad, len(forward))
     whole = 2.0 * math.pi * round(angle / (2.0 * math.pi))
-    turn_vector(drive, plan.i_a, angle, whole, max(BACK_LEAST_S, TURN_S * abs(whole - angle) / math.pi))
+    back_s = max(BACK_LEAST_S, TURN_S * abs(whole - angle) / math.pi)
+    turn_vector(drive, plan.i_a, angle, whole, None if plan.dwell_s is None else back_s)
     come_to_rest(drive, plan.i_a, whole)
     drive.command_current(0.0, 0.0, fixed_angle_rad=whole)
     return forward, backward
@@ -281,29 +304,60 @@ def rotate_vector(drive: Drive, plan: RotationPlan, *, start_rad: float = 0.0) -
 
 def _run(drive: Drive, plan: RotationPlan, angle: float, step: float, count: int | None) -> tuple[float, Trace]:
     """Turn in one direction: a ramp that brings the rotor to speed, the turns, ``count`` steps at least, a ramp."""
+    seen = [_row(drive, angle)]
     for share in plan.ramp:
         angle += share * step
-        _step(drive, plan, angle)
-    rows = [_row(drive, angle)]
+        seen.append(_step(drive, plan, angle, share * step, seen)[0])
+    rows, times = [_row(drive, angle)], [0.0]
     limit = round(2.0 * math.pi * MAX_POLE_PAIRS * plan.turns_mechanical / plan.step_rad)
     if count is not None:
         limit = min(limit, round(BACK_AT_MOST * count))
     while len(rows) < limit:
         angle += step
-        rows.append(_step(drive, plan, angle))
+        row, waited = _step(drive, plan, angle, step, seen + rows)
+        rows.append(row)
+        times.append(times[-1] + waited)
         way = abs(rows[-1]["theta_M_rad"] - rows[0]["theta_M_rad"])
         if way >= 2.0 * math.pi * plan.turns_mechanical and len(rows) >= (count or 0):
             break
+        if plan.dwell_s is None and times[-1] > SWINGS_MOST_S:
+            break
     for share in reversed(plan.ramp):
         angle += share * step
-        _step(drive, plan, angle)
-    return angle, table(rows, [k * plan.dwell_s for k in range(len(rows))], i_command_a=plan.i_a)
+        _step(drive, plan, angle, share * step, seen + rows)
+    return angle, table(rows, times, i_command_a=plan.i_a)
 
 
-def _step(drive: Drive, plan: RotationPlan, angle: float) -> dict[str, float]:
+def _step(
+    drive: Drive, plan: RotationPlan, angle: float, way: float, seen: Sequence[Mapping[str, float]]
+) -> tuple[dict[str, float], float]:
+    """Turn the vector by a way to an angle; return what is seen there, and the time (s).
+
+    Without a time the rotor swings about the middle of its own way, from where it stands beside its vector.
+    """
+    waited = plan.dwell_s
+    if waited is None:
+        drive.command_current(plan.i_a, 0.0, fixed_angle_rad=angle - 0.5 * (way - _off_vector_rad(seen)))
+        waited = turns_back(drive)
     drive.command_current(plan.i_a, 0.0, fixed_angle_rad=angle)
-    drive.wait(plan.dwell_s)
-    return _row(drive, angle)
+    if plan.dwell_s is not None:
+        drive.wait(waited)
+    return _row(drive, angle), waited
+
+
+def _off_vector_rad(rows: Sequence[Mapping[str, float]]) -> float:
+    """Return how far a rotor stands off its vector (rad electrical), by a line through all rows so far.
+
+    A swing that a step leaves is in all later ones, and cogging makes it grow: without it a load of 8 rotors was 37
+    degrees off after a turn and half a turn back, with it up to 10.
+    """
+    if len(rows) < LINE_ROWS:
+        return 0.0
+    imposed, theta = (np.array([row[name] for row in rows]) for name in ("theta_imposed_rad", "theta_M_rad"))
+    if np.ptp(theta) < REST_SPAN_RAD:
+        return 0.0
+    off = np.polyval(np.polyfit(theta, imposed, 1), theta[-1]) - imposed[-1]
+    return float(np.clip(off, -OFF_MOST_RAD, OFF_MOST_RAD))
 
 
 def _row(drive: Drive, angle: float) -> dict[str, float]:

@@ -17,7 +17,7 @@ from pmsmtool.experiments import mechanics_run, rotation, speed_run, square_inje
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.identification.prediction import Prediction
 
-Rotation = tuple[float, float, float, float]
+Rotation = tuple[float, float, float | None, float]
 
 LEVELS = 12
 LOWEST_LEVEL = 0.08
@@ -77,9 +77,26 @@ ALL_SPEEDS = SpeedEffort()
 ALL_LEVELS = LevelEffort()
 
 
+ROTATIONS: tuple[Rotation, ...] = (
+    (0.35, rotation.QUICK_STEP_RAD, rotation.QUICK_DWELL_S, rotation.RAMP_S),
+    (0.35, rotation.SWUNG_RAD, None, 0.0),
+    (0.18, rotation.STEP_RAD, 0.03, 3.0 * rotation.RAMP_S),
+    (0.09, rotation.STEP_RAD, 0.03, 4.0 * rotation.RAMP_S),
+    (0.7, rotation.SWUNG_RAD, None, 0.0),
+)
+"""Current, of the test current, largest step (rad), time per step and ramp (s) of every try. Above psi/(L_q - L_d) a d
+current is no stable position: a reluctance machine follows a smaller vector only, and swings longer on it. Those with
+longer ramps have another speed, too, for a rotor that swings with the first. Without a time per step the rotor swings
+from step to step: a heavy one swings behind every vector that turns by itself. The last is for friction that holds the
+rotor off a smaller vector."""
+
+
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """What is collected; the default is all of it. ``rotations`` are tried before the usual slow turns.
+    """What is collected; the default is all of it. ``rotations`` are tried one after the other.
+
+    Without ``turn_s`` a rotor swings from vector to vector (``experiments/rotation``), as one does that the slow turn
+    left swinging.
 
     With ``quick`` pole pairs, direction and offset come from the rotor's rests on the vectors of levels and pairs,
     where these show them, without the slow turn; levels, pairs and square waves are held as ``quick`` ones. The rotor
@@ -90,7 +107,7 @@ class Effort:
     turn_s: float | None = rotation.TURN_S
     turn_share: float = 0.0
     quick: bool = False
-    rotations: tuple[Rotation, ...] = ()
+    rotations: tuple[Rotation, ...] = ROTATIONS
     shot_samples: int = square_injection.SHOT_SAMPLES
     speeds: SpeedEffort = ALL_SPEEDS
 
@@ -135,7 +152,7 @@ QUICK_NOISE_SAMPLES = 400
 QUICK_TURN_SHARE = 0.3
 """Current that swings the rotor from vector to vector, of the test current: that of the pairs of phases."""
 QUICK_ROTATION: Rotation = (0.35, math.radians(30.0), rotation.QUICK_DWELL_S, 0.35)
-"""Current, step, dwell and ramp of a slow turn that is tried first (``measure.ROTATIONS``): what swings with it takes
+"""Current, step, dwell and ramp of a slow turn that is tried before :data:`ROTATIONS`: what swings with it takes
 those. It serves pole pairs and direction; the offset comes from the speed run."""
 MECHANICS = ("J_kgm2", "B_nms", "tau_c_nm")
 COASTINGS = (1.0, 2.0, 3.0)
@@ -166,8 +183,8 @@ def effort_for(accuracy: float | None, predicted: Callable[[Effort], Prediction]
         (one for one in SPEED_EFFORTS if enough(predicted(Effort(speeds=one)).psi_f, PSI_MISFIT)), SPEED_EFFORTS[-1]
     )
     return Effort(
-        levels, turn_s=None, turn_share=QUICK_TURN_SHARE, quick=True, rotations=(QUICK_ROTATION,), shot_samples=shots,
-        speeds=speeds,
+        levels, turn_s=None, turn_share=QUICK_TURN_SHARE, quick=True, rotations=(QUICK_ROTATION, *ROTATIONS),
+        shot_samples=shots, speeds=speeds,
     )  # fmt: skip
 
 

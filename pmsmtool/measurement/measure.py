@@ -41,7 +41,7 @@ from pmsmtool.experiments.current_limit import (
 )
 from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
-from pmsmtool.experiments.rotation import RAMP_S, turn_vector
+from pmsmtool.experiments.rotation import turn_vector
 from pmsmtool.identification.evaluate import Evaluation, evaluate, flux_of, inductance_of, resistance_of, tolerance_on
 from pmsmtool.identification.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
@@ -71,16 +71,6 @@ PHASE_CHECK_SHARE = 0.05
 TURN_SHARES = (0.15, 0.35, 0.6)
 """Currents that turn the rotor over, of the test current: the first that the encoder shows. A load whose friction takes
 15 % of the rated torque keeps the rotor from following the first."""
-ROTATIONS = (
-    (0.35, rotation.QUICK_STEP_RAD, rotation.QUICK_DWELL_S, RAMP_S),
-    (0.18, rotation.STEP_RAD, 0.03, 3.0 * RAMP_S),
-    (0.09, rotation.STEP_RAD, 0.03, 4.0 * RAMP_S),
-    (0.7, rotation.STEP_RAD, 0.06, 4.0 * RAMP_S),
-)
-"""Current, of the test current, largest step (rad), time per step and ramp (s) of every try. Above psi/(L_q - L_d) a d
-current is no stable position: a reluctance machine follows a smaller vector only, and swings longer on it. The next two
-have another speed and longer ramps, too, for a rotor that swings with the first; the last is for friction and inertia
-that hold the rotor off a smaller vector."""
 SATURATED = 0.01
 """Change of the flux linkage, mean of both signs of i_d over the one without, from which on a machine is mapped: 0.03
 of the saturated profile, below 0.0035 of linear drives, 0.007 to 0.02 beside 5 % of iron loss."""
@@ -209,6 +199,7 @@ class Measurement:
             effort.shot_samples,
             self.held,
             effort.quick,
+            effort.turn_s is None,
         )
         inductances = (
             self._attempt("L", lambda: square.measure(noise, resistance, encoder)) if "square" in steps else None
@@ -562,14 +553,14 @@ class Measurement:
         serves: on the largest current a rotor with much reluctance rests beside the vector.
         """
         jumped: list[tuple[EncoderResult, tuple[Trace, Trace]]] = []
-        for share, step_rad, dwell_s, ramp_s in (*self._effort.rotations, *ROTATIONS):
+        for share, step_rad, dwell_s, ramp_s in self._effort.rotations:
             step, dwell = rotation.step_within(step_rad, dwell_s, self.limits.omega_max_rad_s)
             plan = rotation.RotationPlan(share * self.limits.I_test_apk, step, dwell, ramp_s=ramp_s)
             self.say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
             turns = rotation.rotate_vector(self.drive, plan, start_rad=start_rad)
             self._keep_turns(turns)
             start_rad = 0.0  # where a turn ends
-            last = share == ROTATIONS[-1][0]
+            last = share == self._effort.rotations[-1][0]
             try:
                 found = estimate_encoder(*turns)
             except IdentificationError as error:
@@ -581,6 +572,8 @@ class Measurement:
                     raise
                 continue
             if not (last and jumped and beside_the_vector(found, jumped[0][0])):
+                if dwell is None:
+                    self._effort = replace(self._effort, turn_s=None)
                 return found
         found, turns = min(jumped, key=lambda one: one[0].offset.std)
         self.say(f"  the rotor jumps behind the vector (cogging?): offset +-{math.degrees(found.offset.std):.2g} deg")

@@ -344,7 +344,7 @@ class SpeedStage:
                 "current.options": 7.0,
                 "speed.K_p_nms_per_rad": 2.0 * SPEED_LOOP_RAD_S * J,
                 "speed.K_i_nm_per_rad": SPEED_LOOP_RAD_S**2 * J,
-                "speed.tau_max_nm": TORQUE_OVER * J * per_ampere * i_run,
+                "speed.tau_max_nm": J * per_ampere * min(TORQUE_OVER * i_run, self.limits.I_test_apk),
                 "speed.acceleration_rpm_per_s": rpm_from_rad_s(per_ampere * i_run),
             }
         )

@@ -118,7 +118,8 @@ class SquareStage:
     """The shots on one drive, of so many samples; the other fields are those of ``measure.Measurement``.
 
     With ``quick`` the leads at the first angle are those at the others, a slow square wave takes the place of the
-    second, and a rotor near its vector at a further angle is taken as it stands.
+    second, and a rotor near its vector at a further angle is taken as it stands. One that ``swings`` says itself how
+    long it takes to get there.
     """
 
     drive: Drive
@@ -129,6 +130,7 @@ class SquareStage:
     samples: int = square_injection.SHOT_SAMPLES
     held: bool = False
     quick: bool = False
+    swings: bool = False
 
     def measure(self, noise: Noise, resistance: ResistanceResult, encoder: EncoderResult) -> tuple[float, float]:
         """Record the shots; return rough inductances (H) from ripple and voltage, enough for a current controller.
@@ -255,7 +257,7 @@ class SquareStage:
     def _turn(self, plan: square_injection.SquarePlan, start_rad: float, end_rad: float) -> None:
         """Turn the bias to an angle, and wait for it."""
         turn_s = max(FURTHER_TURN_S, QUARTER_TURN_S * abs(end_rad - start_rad) / (0.5 * math.pi))
-        turn_vector(self.drive, plan.bias_d_a, start_rad, end_rad, None if self.quick else turn_s)
+        turn_vector(self.drive, plan.bias_d_a, start_rad, end_rad, None if self.swings else turn_s)
         square_injection.hold_bias(self.drive, replace(plan, angle_rad=end_rad))
 
     def _rotor(self, encoder: EncoderResult, vector_rad: float) -> float:
