@@ -197,8 +197,7 @@ def measure(task: Task, envelope: Envelope, keep: Keep, say: Say) -> Sequence[st
     Returns what a report says of limits that were not proven.
     """
     # Loaded while the drive is off: it takes 0.3 to 0.8 s, and an energised drive waits 0.35 s for a heartbeat.
-    import scipy.optimize
-    import scipy.signal  # noqa: F401
+    import scipy.optimize  # noqa: F401
 
     run, request, nameplate = task.run, task.request, _nameplate(task)
     run.save(NAMEPLATE, dump_machine_file(nameplate))

@@ -109,7 +109,10 @@ def test_the_response_is_that_of_the_differential_equations(delay: float, lag_s:
         state = one[:2, :2] @ state + one[:2, 2] * u
         state = two[:2, :2] @ state + two[:2, 2] * v
         expected.append(float(state[1] if lag_s else state[0]))
-    assert close(respond(model, COMMAND, T_S, 0.3), np.array(expected))
+    other = replace(model, L_h=2.0 * L_H)
+    found = respond([model, other], COMMAND, T_S, np.array([0.3, 0.1]))
+    assert close(found[0], np.array(expected))
+    assert close(found[1], respond([other], COMMAND, T_S, np.array([0.1]))[0])
 
 
 def test_an_eddy_current_is_the_flux_that_a_first_order_lags_behind() -> None:
@@ -143,7 +146,7 @@ def test_the_inductance_of_the_flux_is_the_slope_of_the_impedance() -> None:
 def _shot(n: int = 240, half_period: int = 6, **parts: object) -> Shot:
     k = np.arange(n)
     u = 5.0 * np.where((k + half_period // 2) // half_period % 2 == 0, 1.0, -1.0) + 0.4
-    i = respond(AxisModel(L_H, R, 1.0, 0.0), u - np.mean(u), T_S, 0.0)
+    (i,) = respond([AxisModel(L_H, R, 1.0, 0.0)], u - np.mean(u), T_S, np.zeros(1))
     i = np.concatenate([np.zeros(n - len(i) + 1), i[:-1]]) + 3.0
     return replace(Shot(u, i, np.zeros(n), half_period, T_S), **parts)
 

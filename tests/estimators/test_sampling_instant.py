@@ -115,8 +115,8 @@ def test_dead_time_moves_the_pulses_of_two_legs_by_half() -> None:
 def test_a_resistance_too_small_to_divide_by_is_none() -> None:
     u = 20.0 * np.sign(np.sin(2 * math.pi * np.arange(60) / 12.0 + 0.1))
     share = np.abs(u) / 100.0
-    pulses = Pulses(share, u / share, 0.0)
-    small, none = (respond(AxisModel(3e-3, R_ohm, 1.0, 0.0), u, T_S, 0.3, pulses) for R_ohm in (1e-3, 1e-12))
+    models = [AxisModel(3e-3, R_ohm, 1.0, 0.0) for R_ohm in (1e-3, 1e-12)]
+    small, none = respond(models, u, T_S, np.array([0.3, 0.3]), Pulses(share, u / share, 0.0))
     assert np.max(np.abs(small - none)) < 1e-3 * np.max(np.abs(none))  # measured 3e-4: R T_s/L each period
 
 
@@ -127,7 +127,7 @@ def test_pulses_against_steps_between_all_edges(delay: float, lag_s: float) -> N
     rng = np.random.default_rng(3)
     u = 20.0 * np.sign(np.sin(2 * math.pi * np.arange(60) / 12.0 + 0.1)) + rng.standard_normal(60)
     share, rest_v = np.abs(u) / 100.0, -0.7
-    found = respond(model, u, T_S, 0.3, Pulses(share, u / share, rest_v))
+    found = respond([model], u, T_S, np.array([0.3]), Pulses(share, u / share, rest_v))[0]
 
     # every edge and every sample on one axis of time; between them a constant voltage and a matrix exponential
     edges = {float(k) for k in range(3, 50)}

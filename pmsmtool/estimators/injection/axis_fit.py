@@ -150,7 +150,8 @@ class _Problem:
         for index, (shot, slow) in enumerate(zip(self.shots, self.slow, strict=True)):
             changed = [k for k in range(shared) if moved[k][index] != here[index]]
             at, *others = simulate([here[index], *(moved[k][index] for k in changed)], shot, slow)
-            decay = respond(here[index].model, np.zeros(len(shot.u_v)), shot.period_s, 1.0)[-len(slow) - 1 : -1]
+            rest, one = np.zeros(len(shot.u_v)), np.ones(1)
+            (decay,) = respond([here[index].model], rest, shot.period_s, one)[:, -len(slow) - 1 : -1]
             columns = [
                 *((other - at) / steps[k] for k, other in zip(changed, others, strict=True)),
                 self.layout.ripple_a * decay,

@@ -44,7 +44,8 @@ class VoltageError:
 
     def lost_v(self, i_a: NDArray[np.float64]) -> NDArray[np.float64]:
         """Mean error in each interval between samples of currents (V), shape (..., n - 1)."""
-        early, late = np.interp(i_a, self.i_a, self.early_v), np.interp(i_a, self.i_a, self.late_v)
+        both = np.interp(i_a, self.i_a, self.early_v + 1j * self.late_v)  # one search for the two
+        early, late = both.real, both.imag
         before = EDGE_SHARE * early + (1.0 - EDGE_SHARE) * late
         after = (1.0 - EDGE_SHARE) * early + EDGE_SHARE * late
         return np.asarray(before[..., :-1] + after[..., 1:], dtype=np.float64)
@@ -120,7 +121,8 @@ def simulate(responses: Sequence[Response], shot: Shot, slow: NDArray[np.float64
     T_s = shot.period_s
     count = len(shot.i_a) - SKIP_SAMPLES
     command, pulses = shot.u_v - np.mean(shot.u_v), shot.pulses
-    linear = np.stack([respond(response.model, command, T_s, response.start_a, pulses) for response in responses])
+    starts = np.array([response.start_a for response in responses])
+    linear = respond([response.model for response in responses], command, T_s, starts, pulses)
     if any(response.model.eddy_s for response in responses):
         linear = linear + np.stack([eddy_current(response.model, command, T_s) for response in responses])
     centre_a = float(np.mean(shot.i_a))
@@ -131,7 +133,7 @@ def simulate(responses: Sequence[Response], shot: Shot, slow: NDArray[np.float64
     curved, moves = bool(np.any(c_2) or np.any(c_3)), bool(np.any(motion))
     if not curved and not moves and shot.error is None:
         return linear[:, -count - 1 : -1]
-    steps = [response.model.advance(T_s)[:2] for response in responses]
+    poles, gains = np.array([response.model.advance(T_s)[:2] for response in responses]).T[..., np.newaxis]
     # the slow part of the modelled current stands for nothing: the starting current alone decides it
     y = linear
     fast = fast_part(y, slow)
@@ -145,7 +147,7 @@ def simulate(responses: Sequence[Response], shot: Shot, slow: NDArray[np.float64
         if shot.error is not None:
             middle = middle + shot.error.lost_v(fast_i + centre_a)
         middle -= np.mean(middle, axis=1, keepdims=True)
-        y = linear + np.stack([recursion(a, -gain * row, 0.0) for (a, gain), row in zip(steps, middle, strict=True)])
+        y = linear + recursion(poles, -gains * middle, 0.0)
         if curved or remaining:
             fast = fast_part(y, slow)
     i = y + bend(fast, c_2, c_3) if curved else y

@@ -16,6 +16,7 @@ distance of y from the bias, so that L stays the incremental inductance *at* the
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,11 +93,23 @@ class Pulses:
     """Constant voltage beside them (V): minus the mean of the commands."""
 
 
-def recursion(pole: float, drive: Array, start: float) -> Array:
-    """Return x with x[0] = start and x[k+1] = pole x[k] + drive[k]; shape (n + 1,) for drive of shape (n,)."""
-    from scipy.signal import lfilter
+def recursion(
+    pole: float | NDArray[np.float64], drive: NDArray[np.float64], start: float | Array
+) -> NDArray[np.float64]:
+    """Return x with x[0] = start and x[k+1] = pole x[k] + drive[k] along the last axis, shape (..., n + 1).
 
-    return np.append(start, lfilter([1.0], [1.0, -pole], drive, zi=[pole * start])[0])
+    ``pole`` is a number, or a column (m, 1) beside rows of drives, shape (m, n), with m starts or one. A bidiagonal
+    system: the bits of ``scipy.signal.lfilter`` in half its time, and without the 0.6 s that its import takes.
+    """
+    from scipy.linalg.lapack import dtbtrs
+
+    x = np.empty((*drive.shape[:-1], drive.shape[-1] + 1))
+    x[..., 0], x[..., 1:] = start, drive
+    bands = np.ones((*x.shape, 2))
+    bands[..., 1] = -pole
+    bands[..., -1, 1] = 0.0  # the next row begins afresh
+    solved, _ = dtbtrs(bands.reshape(-1, 2).T, x.reshape(-1), uplo="L", diag="U", overwrite_b=1)
+    return np.asarray(solved).reshape(x.shape)
 
 
 def acting_voltages(command: Array, delay: float) -> tuple[Array, Array, float]:
@@ -126,34 +139,43 @@ def acting_voltages(command: Array, delay: float) -> tuple[Array, Array, float]:
     return early, late, fraction
 
 
-def respond(model: AxisModel, command: Array, period_s: float, start_a: float, pulses: Pulses | None = None) -> Array:
-    """Measured current from the first modelled sample on, shape (n - first + 1,), in equilibrium at ``start_a``.
+def respond(
+    models: Sequence[AxisModel], command: Array, period_s: float, start_a: Array, pulses: Pulses | None = None
+) -> NDArray[np.float64]:
+    """Measured currents from the first modelled sample on, shape (m, n - first + 1), in equilibrium at ``start_a``.
 
     Parameters
     ----------
-    model : AxisModel
-        Parameters.
+    models : sequence of AxisModel
+        Parameters; the delays have the same whole part, and all have a lag or none.
     command : ndarray, shape (n,)
         Voltage computed at each sample minus its constant part (V).
     period_s : float
         Control period (s).
-    start_a : float
+    start_a : ndarray, shape (m,)
         Current and sensor output at the first modelled sample (A).
     pulses : Pulses or None
         How the bridge applies the commands; None: as their mean.
     """
     if pulses is not None:
-        return _respond_to_pulses(model, pulses, period_s, start_a)
-    early, late, fraction = acting_voltages(command, model.delay)
-    a_1, b_1, e_1, c_1, d_1 = model.advance(fraction * period_s)
-    a_2, b_2, e_2, c_2, d_2 = model.advance((1.0 - fraction) * period_s)
+        return _respond_to_pulses(models, pulses, period_s, start_a)
+    early, late, _ = acting_voltages(command, models[0].delay)
+    fractions = [model.delay - math.floor(model.delay) for model in models]
+    pairs = list(zip(models, fractions, strict=True))
+    a_1, b_1, e_1, c_1, d_1 = _columns([model.advance(part * period_s) for model, part in pairs])
+    a_2, b_2, e_2, c_2, d_2 = _columns([model.advance((1.0 - part) * period_s) for model, part in pairs])
     # i after both parts, then y after both parts with the current in between eliminated
     current = recursion(a_1 * a_2, a_2 * b_1 * early + b_2 * late, start_a)
-    if model.lag_s <= 0.0:
+    if models[0].lag_s <= 0.0:
         return current
-    inside = a_1 * current[:-1] + b_1 * early
-    forced = e_2 * (c_1 * current[:-1] + d_1 * early) + c_2 * inside + d_2 * late
+    inside = a_1 * current[:, :-1] + b_1 * early
+    forced = e_2 * (c_1 * current[:, :-1] + d_1 * early) + c_2 * inside + d_2 * late
     return recursion(e_1 * e_2, forced, start_a)
+
+
+def _columns(rows: Sequence[tuple[float, ...]]) -> NDArray[np.float64]:
+    """Return coefficients of models as columns beside their responses, shape (k, m, 1)."""
+    return np.array(rows).T[..., np.newaxis]
 
 
 def eddy_current(model: AxisModel, command: Array, period_s: float) -> Array:
@@ -169,19 +191,22 @@ def eddy_current(model: AxisModel, command: Array, period_s: float) -> Array:
     return np.asarray(slope * (model.eddy_s / model.L_h))
 
 
-def _respond_to_pulses(model: AxisModel, pulses: Pulses, period_s: float, start_a: float) -> Array:
+def _respond_to_pulses(
+    models: Sequence[AxisModel], pulses: Pulses, period_s: float, start_a: Array
+) -> NDArray[np.float64]:
     """As :func:`respond`, every edge of a pulse at its own time."""
-    early_v, late_v, fraction = acting_voltages(pulses.height_v, model.delay)
-    early_w, late_w, _ = acting_voltages(pulses.share, model.delay)
-    begun = 1.0 - fraction  # of the early command's period, at the sample
-    a, b, e, c, d = model.advance(period_s)
-    forced = np.full((2, len(early_v)), pulses.rest_v) * np.array([[b], [d]])
-    for height, share, gone in ((early_v, early_w, begun), (late_v, late_w, begun - 1.0)):
-        forced += height * _charged(model, share, gone, period_s)
+    early_v, late_v, _ = acting_voltages(pulses.height_v, models[0].delay)
+    early_w, late_w, _ = acting_voltages(pulses.share, models[0].delay)
+    a, b, e, c, d = _columns([model.advance(period_s) for model in models])
+    forced = np.array([b, d]) * np.full(len(early_v), pulses.rest_v)
+    for k, model in enumerate(models):
+        begun = 1.0 - (model.delay - math.floor(model.delay))  # of the early command's period, at the sample
+        for height, share, gone in ((early_v, early_w, begun), (late_v, late_w, begun - 1.0)):
+            forced[:, k] += height * _charged(model, share, gone, period_s)
     current = recursion(a, forced[0], start_a)
-    if model.lag_s <= 0.0:
+    if models[0].lag_s <= 0.0:
         return current
-    return recursion(e, c * current[:-1] + forced[1], start_a)
+    return recursion(e, c * current[:, :-1] + forced[1], start_a)
 
 
 def _charged(model: AxisModel, share: Array, gone: float, period_s: float) -> NDArray[np.float64]:
