@@ -29,11 +29,16 @@ _MS_NS = 1_000_000
 
 @dataclass(slots=True)
 class _Pdo:
-    """One PDO: its keys' prefix and what it carries now."""
+    """One PDO: its keys' prefix, what its objects say, taken over where they are written, and what it carries now."""
 
     name: str
     entries: list[tuple[Entry, int]] = field(default_factory=list)
     """Objects and their bytes."""
+    is_valid: bool = False
+    can_id: int = 0
+    kind: int = 0
+    inhibit_ns: int = 0
+    event_ns: int = 0
     last: bytes = b""
     free_ns: int = 0
     sent_ns: int = 0
@@ -97,6 +102,8 @@ class ProcessData:
         entries[f"{pdo.name}.count"].sink = partial(self._take_count, pdo)
         for number in range(MAX_OBJECTS):
             entries[f"{pdo.name}.object_{number + 1}"].sink = partial(self._take_object, pdo, number)
+        if f"{pdo.name}.inhibit" in entries:
+            entries[f"{pdo.name}.inhibit"].sink = partial(self._take_inhibit, pdo)
         for key in ("type", "event_ms"):
             if f"{pdo.name}.{key}" in entries:
                 entries[f"{pdo.name}.{key}"].sink = partial(self._take_plain, f"{pdo.name}.{key}")
@@ -106,6 +113,10 @@ class ProcessData:
             raise Refused(AbortCode.VALUE)  # reserved, or on remote request only
         self._dictionary[key].value = data
         self.configure()
+
+    def _take_inhibit(self, pdo: _Pdo, data: bytes) -> None:
+        self._dictionary[f"{pdo.name}.inhibit"].value = data
+        pdo.inhibit_ns = self._number(pdo, "inhibit") * _TICK_NS
 
     def _take_cob_id(self, pdo: _Pdo, data: bytes) -> None:
         entry = self._dictionary[f"{pdo.name}.cob_id"]
@@ -124,7 +135,7 @@ class ProcessData:
         self._dictionary[f"{pdo.name}.object_{number + 1}"].value = data
 
     def _take_count(self, pdo: _Pdo, data: bytes) -> None:
-        if not self._number(pdo, "cob_id") & _OFF:
+        if self._is_on(pdo):
             raise Refused(AbortCode.ACCESS)
         self._collect(pdo, data[0])
         self._dictionary[f"{pdo.name}.count"].value = data
@@ -163,20 +174,19 @@ class ProcessData:
     def configure(self) -> None:
         """Take over what the communication and mapping objects say."""
         self.receive_ids.clear()
-        for pdo in self._rpdos:
-            pdo.entries = self._mapping(pdo)
-            cob_id = self._number(pdo, "cob_id")
-            if not cob_id & _OFF:
-                self.receive_ids[cob_id & 0x7FF] = pdo
+        for pdo in (*self._rpdos, *self._tpdos):
+            pdo.entries, pdo.kind = self._mapping(pdo), self._number(pdo, "type")
+            pdo.can_id = self._number(pdo, "cob_id") & 0x7FF
+            pdo.is_valid = bool(pdo.entries) and self._is_on(pdo)
+        self.receive_ids.update((pdo.can_id, pdo) for pdo in self._rpdos if self._is_on(pdo))
         for pdo in self._tpdos:
-            pdo.entries = self._mapping(pdo)
+            pdo.inhibit_ns = self._number(pdo, "inhibit") * _TICK_NS
+            pdo.event_ns = self._number(pdo, "event_ms") * _MS_NS
             pdo.last = b""
-            if pdo.event is not None:
-                pdo.event.cancel()
             self._plan_event(pdo)
 
-    def _is_valid(self, pdo: _Pdo) -> bool:
-        return bool(pdo.entries) and not self._number(pdo, "cob_id") & _OFF
+    def _is_on(self, pdo: _Pdo) -> bool:
+        return not self._number(pdo, "cob_id") & _OFF
 
     # ---- received ------------------------------------------------------------------------------
 
@@ -189,7 +199,7 @@ class ProcessData:
         length = sum(size for _, size in pdo.entries)
         if len(data) < length:
             self._fault(TOO_SHORT)
-        elif self._number(pdo, "type") in _SYNC_TYPES or self._number(pdo, "type") == 0:
+        elif pdo.kind in _SYNC_TYPES or pdo.kind == 0:
             pdo.waiting = data
         else:
             self._take(pdo, data)
@@ -245,7 +255,7 @@ class ProcessData:
         if not self._operational():
             return
         for pdo in self._tpdos:
-            if self._is_valid(pdo) and self._number(pdo, "type") in _EVENT_TYPES:
+            if pdo.is_valid and pdo.kind in _EVENT_TYPES:
                 content = self._content(pdo)
                 if content != pdo.last:
                     self._emit(pdo, content)
@@ -257,12 +267,12 @@ class ProcessData:
                 pdo.deferred = self._schedule.at(pdo.free_ns, lambda: self._emit_deferred(pdo))
             return
         pdo.last = content
-        pdo.free_ns = now + self._number(pdo, "inhibit") * _TICK_NS
-        self._transmit(pdo, self._number(pdo, "cob_id") & 0x7FF, content)
+        pdo.free_ns = now + pdo.inhibit_ns
+        self._transmit(pdo, content)
 
-    def _transmit(self, pdo: _Pdo, can_id: int, content: bytes) -> None:
+    def _transmit(self, pdo: _Pdo, content: bytes) -> None:
         """Send, as late as the node is this time, in the order of the samples."""
-        late_s = next(self._lateness)
+        can_id, late_s = pdo.can_id, next(self._lateness)
         if late_s == 0.0:
             self._send(can_id, content)
             return
@@ -271,20 +281,19 @@ class ProcessData:
 
     def _emit_deferred(self, pdo: _Pdo) -> None:
         pdo.deferred = None
-        if self._operational() and self._is_valid(pdo):
+        if self._operational() and pdo.is_valid:
             self._emit(pdo, self._content(pdo))
 
     def _plan_event(self, pdo: _Pdo) -> None:
         if pdo.event is not None:
             pdo.event.cancel()
             pdo.event = None
-        period_ns = self._number(pdo, "event_ms") * _MS_NS
-        if period_ns and self._is_valid(pdo) and self._number(pdo, "type") in _EVENT_TYPES and self._operational():
-            pdo.event = self._schedule.at(self._schedule.now_ns + period_ns, lambda: self._on_event(pdo))
+        if pdo.event_ns and pdo.is_valid and pdo.kind in _EVENT_TYPES and self._operational():
+            pdo.event = self._schedule.at(self._schedule.now_ns + pdo.event_ns, lambda: self._on_event(pdo))
 
     def _on_event(self, pdo: _Pdo) -> None:
         pdo.event = None
-        if self._operational() and self._is_valid(pdo):
+        if self._operational() and pdo.is_valid:
             self._emit(pdo, self._content(pdo))
         self._plan_event(pdo)
 
@@ -297,17 +306,16 @@ class ProcessData:
                 data, pdo.waiting = pdo.waiting, None
                 self._take(pdo, data)
         for pdo in self._tpdos:
-            if self._is_valid(pdo):
+            if pdo.is_valid:
                 self._sync_one(pdo)
 
     def _sync_one(self, pdo: _Pdo) -> None:
-        kind = self._number(pdo, "type")
-        if kind == 0:
+        if pdo.kind == 0:
             content = self._content(pdo)
             if content != pdo.last:
                 self._emit(pdo, content)
-        elif kind in _SYNC_TYPES:
+        elif pdo.kind in _SYNC_TYPES:
             pdo.syncs += 1
-            if pdo.syncs >= kind:
+            if pdo.syncs >= pdo.kind:
                 pdo.syncs = 0
                 self._emit(pdo, self._content(pdo))
