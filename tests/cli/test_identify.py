@@ -16,6 +16,7 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
+from pmsmtool.experiments import standstill
 from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.run_directory import RunDirectory
@@ -148,8 +149,9 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
 
 @pytest.mark.chain
 @pytest.mark.parametrize("case", REFUSED)
-def test_a_bad_machine_is_refused_by_name(case: str, tool: Tool) -> None:
+def test_a_bad_machine_is_refused_by_name(case: str, tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
     simulation, name = REFUSED[case]
+    monkeypatch.setattr(standstill, "SWING_LIMIT_S", 2.0)  # in such a noise no current arrives, and all is waited for
     channel = profile("interior-2k2", **simulation)
     with PmsmSimBus(channel):
         before = held(channel)

@@ -76,10 +76,9 @@ def state_of_drive(server: Server) -> tuple[State | None, bytes]:
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize("delay_s", [0.0, 0.15, 0.6])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(("number", "delay_s"), [(signal.SIGINT, 0.0), (signal.SIGTERM, 0.15), (signal.SIGINT, 0.6)])
 def test_interrupted_jog_is_stopped_restored_and_130(
-    server: Server, tmp_path: Path, delay_s: float, number: signal.Signals
+    server: Server, tmp_path: Path, number: signal.Signals, delay_s: float
 ) -> None:
     process = jogging(server, tmp_path)
     time.sleep(delay_s)
