@@ -71,6 +71,10 @@ STEP_SHARE = 0.1
 COARSE_RIPPLES = (0.3, 0.03, 3e-3, 3e-4)
 """Least noise of the torque in the first fits, of the push's, one after the other: with an encoder's resolution alone
 the cost is a narrow, bent valley in which a fit from rough starting values does not arrive (1 of 160 realisations)."""
+COST_TOLERANCE, COARSE_TOLERANCE = 1e-4, 1.0
+"""Fall of the whitened cost below which a fit is done, a hundredth of a standard deviation, and one of the first fits,
+which only lead there: with the smaller one there, too, values moved by 6e-5 of their deviations, for a fifth more
+time."""
 FITS_MOST = 10
 """Fits after it; the second whitens with the inertia of the first, more only where the torque's noise grows."""
 PATIENT_FITS = 2
@@ -472,9 +476,9 @@ def _fit(runs: Sequence[Run], start: Array, elastic: bool) -> tuple[Fit, float, 
         coarse = [replace(run, torque_std=max(run.torque_std, share * largest)) for run in runs]
         if not count:  # a rough start knows nothing of the disturbances
             bare = [replace(run, disturbances=NONE) for run in coarse]
-            x = _minimum(bare, x, sizes_of(bare, drag=True)).x
+            x = _minimum(bare, x, sizes_of(bare, drag=True), COARSE_TOLERANCE).x
             x = np.insert(x, SHAFT + 1, np.zeros(len(scale) - len(x)))
-        x = _minimum(coarse, x, scale).x
+        x = _minimum(coarse, x, scale, COARSE_TOLERANCE).x
     for count in range(FITS_MOST):
         fit = _minimum(runs, x, scale)
         x = fit.x
@@ -500,8 +504,8 @@ def _without_shapes(fit: Fit, traces: int) -> Array:
     return np.delete(fit.x, range(SHAFT, len(fit.x) - 2 * traces))
 
 
-def _minimum(runs: Sequence[Run], x: Array, scale: Array) -> Fit:
+def _minimum(runs: Sequence[Run], x: Array, scale: Array, tolerance: float = COST_TOLERANCE) -> Fit:
     factors = [whitener(run, math.exp(float(x[0]))) for run in runs]
     sizes = runs[0].disturbances.torque.shape[1]
     problem = Problem(runs, factors, RELATIVE_STEP * scale, drag=len(x) == SHAFT + 1 + sizes + 2 * len(runs))
-    return levenberg_marquardt(problem.residual, x, scale, cost_tolerance=1e-4, derivative=problem.jacobian)
+    return levenberg_marquardt(problem.residual, x, scale, cost_tolerance=tolerance, derivative=problem.jacobian)

@@ -11,6 +11,7 @@ import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -131,11 +132,11 @@ class Problem:
         """Its derivative, shape (n, k); one-sided for the disturbances, which hardly bend it."""
         blocks = []
         for k, run in enumerate(self.runs):
-            block = np.zeros((len(run.theta), len(x)))
-            first = self.sizes.start
+            block = np.zeros((len(run.theta), self.shared + 2))  # of the traces' own parameters only its own move it
+            first, own = self.sizes.start, [*range(self.shared), self.shared + 2 * k, self.shared + 2 * k + 1]
             if self.shared > first:
                 block[:, self.sizes] = run.disturbances.position
-            block[:, self.shared + 2 * k] = 1.0  # the first position
+            block[:, self.shared] = 1.0  # the first position
             turning = first + np.flatnonzero(np.any(run.disturbances.torque, axis=0))
             moved = np.array([*turning, *range(first), self.shared + 2 * k + 1])
             plus, minus = np.tile(x, (2, len(moved), 1))
@@ -145,8 +146,9 @@ class Problem:
             minus[: len(turning)] = x  # one of these rows serves all
             off = self._off(k, np.concatenate([plus, minus[same:]]))
             change = off[: len(moved)] - off[np.maximum(at[0] - same, 0) + len(moved)]
-            block[:, moved] = (change / (plus[at] - minus[at])[:, np.newaxis]).T
-            blocks.append(self.factors[k] @ block)  # one product of matrices instead of one per column and side
+            block[:, [*moved[:-1], self.shared + 1]] = (change / (plus[at] - minus[at])[:, np.newaxis]).T
+            blocks.append(np.zeros((len(run.theta), len(x))))
+            blocks[k][:, own] = self.factors[k] @ block  # one product of matrices, not one per column and side
         return np.concatenate([*blocks, np.eye(len(x))[self.sizes]])
 
 
@@ -156,16 +158,28 @@ def whitener(run: Run, J: float) -> Array:
 
     if run.torque_std == 0.0:
         return np.diag(1.0 / run.theta_std)
-    G = _ways(run, J)
-    covariance = np.diag(run.theta_std**2) + run.torque_std**2 * (G @ G.T)
+    covariance = (run.torque_std * run.T**2 / J) ** 2 * _spread(len(run.theta))
+    covariance[np.diag_indices(len(run.theta))] += run.theta_std**2
     return np.asarray(dtrtri(np.linalg.cholesky(covariance), lower=1)[0])
 
 
 def _ways(run: Run, J: float) -> Array:
     """Return the ways that a torque in each interval has made at each position (rad/(N m)), without friction."""
-    n = len(run.theta)
-    lag = np.arange(n)[:, None] - np.arange(n - 1)[None, :] - 0.5
-    return np.asarray(np.maximum(lag, 0.0) * run.T**2 / J)
+    return _lags(len(run.theta)) * (run.T**2 / J)
+
+
+def _lags(n: int) -> Array:
+    """Return n positions' distances behind the middle of each interval before them, in intervals."""
+    return np.asarray(np.maximum(np.arange(n)[:, None] - np.arange(n - 1)[None, :] - 0.5, 0.0))
+
+
+@lru_cache(maxsize=16)
+def _spread(n: int) -> Array:
+    """Return G G' over (T^2/J)^2: every fit of a trace asks for it, and only its factor changes."""
+    lags = _lags(n)
+    spread = np.asarray(lags @ lags.T)
+    spread.setflags(write=False)
+    return spread
 
 
 def torque_noise(runs: Sequence[Run]) -> dict[bool, float]:
