@@ -8,6 +8,7 @@ supply meanwhile, they give the copper loss of a resting rotor.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -93,6 +94,8 @@ TRIES = 6
 """Windows taken at one level until the shaft did not move in one; the last stands as it is."""
 DRIFTED = 5e-4
 """Change of the voltage between the halves of a window, relative, that asks for another window."""
+LOW_SHARE = 0.1
+"""Levels up to this share of the largest are low ones: R is fitted from 0.28 on, the flux run begins at 0.15."""
 CREPT = 1e-3
 """The same of the current, of the largest level, where the voltage's limit is ``DRIFTED``: a rotor that leaves a vector
 slowly turns the voltage into both."""
@@ -126,7 +129,8 @@ class LevelPlan:
     angle_rad: float = DC_ANGLE_RAD
     """Electrical angle of the vector in the stator frame."""
     drift: float = DRIFTED
-    """Change of the voltage between the halves of a window, relative, that asks for another window."""
+    """Change of the voltage between the halves of a window, relative, that asks for another window; of the largest
+    voltage so far on a low level of a quick plan: its current is the slowest, and it serves the inverter curve."""
     turn_s: float | None = TURN_S
     """Time of a turn of the vector, of the waits alone (s); None: as long as the rotor swings."""
     quick: bool = False
@@ -208,10 +212,14 @@ def record_zero_current(drive: Drive, samples: int = NOISE_SAMPLES) -> Trace:
 
 PERIODS = 512
 """Of the means of one vector, in two halves."""
+PHASE_HALF_S, PHASE_REST_S = 0.008, 0.05
+"""Longest half of the window of a small vector (s): a current that a swinging rotor moves stays no longer. And the time
+over which a rotor at rest does not move: one that turns back looks at rest in a shorter one."""
 
 
-PHASE_ARRIVED = 0.03
-"""As ``ARRIVED``, of either half of their window: the phases' currents may differ by 10 %."""
+PHASE_ARRIVED = 0.045
+"""As ``ARRIVED``, of either half of their window: the phases' currents may differ by 10 %. With 0.03 the current of a
+heavy rotor's swing was waited for, for up to 1.5 s."""
 INDUCED = 0.1
 """Voltage across a small vector, of the one along it, up to which a turning rotor induces little: what it adds to u/i
 is less still, and u/i may differ by 30 %."""
@@ -230,24 +238,26 @@ def hold_phase_vectors(drive: Drive, i_a: float, angles_rad: Sequence[float] = P
     times = []
     elapsed = 0.0
     near, last = angles_rad == NEAR_ANGLES_RAD, angles_rad[0]
+    half = min(PERIODS // 2, round(PHASE_HALF_S / drive.period_s)) if near else PERIODS // 2
     for angle in angles_rad:
         if rows:
             drive.disable()
             drive.enable()
-        begun, before, since, stays_a = elapsed, math.inf, elapsed, complex(math.inf)
+        begun, since, stays_a = elapsed, elapsed, complex(math.inf)
+        seen: deque[float] = deque(maxlen=max(2, math.ceil(PHASE_REST_S / (2 * half * drive.period_s))))
         if rows and near:
             elapsed += turn_vector(drive, i_a, last, angle, None)
         last = angle
         drive.command_current(i_a, 0.0, fixed_angle_rad=angle)
         while True:
-            first, second, _ = drive.halves(names, PERIODS // 2)
-            elapsed += PERIODS * drive.period_s
+            first, second, _ = drive.halves(names, half)
+            elapsed += 2 * half * drive.period_s
             halves = first, second
             arrived = all(math.hypot(part["i_d_a"] - i_a, part["i_q_a"]) <= PHASE_ARRIVED * i_a for part in halves)
             induced = any(abs(part["u_q_v"]) > INDUCED * abs(part["u_d_v"]) for part in halves)
-            # a rotor that turns back looks at rest in one window, not in two
-            rests = all(abs(second["theta_m_rad"] - seen) < REST_RAD for seen in (first["theta_m_rad"], before))
-            before = second["theta_m_rad"]
+            seen.append(second["theta_m_rad"])
+            angles = first["theta_m_rad"], *seen
+            rests = len(seen) == seen.maxlen and max(angles) - min(angles) < REST_RAD
             if arrived and (rests or not induced):
                 break
             if not abs((i_dq_a := complex(second["i_d_a"], second["i_q_a"])) - stays_a) <= PHASE_ARRIVED * i_a:
@@ -424,6 +434,7 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
     times: list[float] = []
     elapsed = 0.0
     angle, stood, turn_s, looked = plan.start_rad, math.inf, plan.turn_s, not plan.quick
+    highest_v = 0.0
     for level in plan.levels_a:
         sign = math.copysign(1.0, level)
         target = plan.angle_rad if sign > 0.0 else plan.angle_rad + math.pi
@@ -447,7 +458,9 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
             turned = abs(second["theta_m_rad"] - first["theta_m_rad"])
             drifted = abs(second["u_d_v"] - first["u_d_v"])
             crept = abs(second["i_d_a"] - first["i_d_a"])
-            still = drifted <= plan.drift * abs(first["u_d_v"]) and crept <= CREPT * (plan.drift / DRIFTED) * largest
+            highest_v = max(highest_v, abs(first["u_d_v"]))
+            of_v = highest_v if plan.quick and abs(level) <= LOW_SHARE * largest else abs(first["u_d_v"])
+            still = drifted <= plan.drift * of_v and crept <= CREPT * (plan.drift / DRIFTED) * largest
             moved = turned >= REST_RAD or not still
             if plan.quick:
                 stood = second["theta_m_rad"]

@@ -20,6 +20,7 @@ from pmsmtool.experiments.standstill import (
     NEAR_ANGLES_RAD,
     PAIR_ARRIVED,
     PHASE_ARRIVED,
+    PHASE_HALF_S,
     SWINGING_TURN_S,
     LevelPlan,
     calm_sequence,
@@ -185,6 +186,42 @@ def test_a_current_that_does_not_come_at_a_shaft_that_stands_is_not_waited_for()
     vectors = hold_phase_vectors(drive, I_A)  # type: ignore[arg-type]
     assert vectors["i_d_a"] == pytest.approx([0.1 * I_A] * 3)
     assert drive.waited < 3 * 2.5 * ARRIVAL_LIMIT_S
+
+
+@pytest.mark.parametrize("period_s", [2.5e-5, 1.25e-4])
+def test_windows_of_small_vectors_are_short_at_every_control_frequency(period_s: float) -> None:
+    """At 8 kHz 256 periods were 32 ms: a current that a rotor moves stayed in no such window for 2 s."""
+    taken = []
+
+    class Slow(LateDrive):
+        def halves(self, signals: Sequence[str], periods: int) -> Halves:
+            taken.append(periods * self.period_s)
+            return super().halves(signals, periods)
+
+    drive = Slow(0.0, 0)
+    drive.period_s = period_s
+    drive.enable = drive.disable = lambda: None  # type: ignore[attr-defined]
+    hold_phase_vectors(drive, I_A, NEAR_ANGLES_RAD)  # type: ignore[arg-type]
+    assert max(taken) <= PHASE_HALF_S * (1.0 + 1e-9)
+
+
+@pytest.mark.parametrize(("quick", "windows"), [(True, 1), (False, standstill.TRIES)])
+def test_a_low_level_is_held_again_by_the_largest_voltage(quick: bool, windows: int) -> None:
+    """Its current comes last and serves the inverter curve alone: it took two windows of every drive."""
+
+    class Creeping(LateDrive):
+        def average(self, signals: Sequence[str], periods: int) -> Mapping[str, float]:
+            return {**super().average(signals, periods), "u_d_v": self.wanted_a}
+
+        def halves(self, signals: Sequence[str], periods: int) -> Halves:
+            first, second, samples = super().halves(signals, periods)
+            return Halves(first, {**second, "u_d_v": second["u_d_v"] + 0.001}, samples)
+
+    drive = Creeping(0.0, 0)
+    plan = LevelPlan((4.0, 0.2), 1.5, DC_ANGLE_RAD, quick=quick)
+    hold_levels(drive, plan)  # type: ignore[arg-type]
+    # 1 mV is little of 4 V, and 0.5 % of 0.2 V
+    assert drive.taken == 1 + windows
 
 
 def test_a_vector_that_is_led_on_reaches_every_angle_forward() -> None:
