@@ -51,8 +51,8 @@ HOLD_S, HELD_S = 0.05, 0.25
 of 25 rad/s whose current the inverter's error slows rings with that period: 50 ms of it gave 1.2 A in place of 0.2."""
 SETTLE_S, SETTLE_MOST_S = 0.025, 0.1
 """Shortest and longest time between a current's command and its window (s)."""
-WINDOW_S = 0.06
-"""Shortest window of the d currents (s)."""
+WINDOW_S, LONGEST_S = 0.06, 0.2
+"""Shortest window of the d currents, and longest turn of the shaft that one takes (s)."""
 Q_WINDOW_S = 0.03
 """Shortest window of a q current, which accelerates the shaft."""
 LOOP_PERIODS = 6.0
@@ -78,7 +78,7 @@ class SpeedPlan:
     first_s: float = 0.05
     """The same after the speed controller (s)."""
     window_s: float = WINDOW_S
-    longest_s: float = 0.2
+    longest_s: float = LONGEST_S
     """Shortest window, rounded up to whole mechanical turns; where one turn is longer than the longest, whole
     electrical turns must do (s)."""
     q_window_s: float = Q_WINDOW_S

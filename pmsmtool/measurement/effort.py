@@ -65,6 +65,7 @@ class SpeedEffort:
     d_shares: tuple[tuple[float, ...], ...] = speed_run.D_SHARES
     q_at: tuple[int, ...] = speed_run.Q_AT
     window_s: float = speed_run.WINDOW_S
+    longest_s: float = speed_run.LONGEST_S
     push_samples: int = 1024
     mechanics_rows: int = mechanics_run.ROWS
     speed_share: float = 1.0
@@ -143,8 +144,8 @@ LEVEL_EFFORTS = (
 )
 SHOT_EFFORTS = (256, 512, 1024, square_injection.SHOT_SAMPLES)
 _TWO_SPEEDS = SpeedEffort(
-    (0.42, 0.85), ((1.0,), (1.0 / 3.0, 1.0, 1.0)), (0,), window_s=0.04, push_samples=128, mechanics_rows=400,
-    answer_samples=64, answer_share=0.05, quick=True,
+    (0.42, 0.85), ((1.0,), (1.0 / 3.0, 1.0, 1.0)), (0,), window_s=0.03, longest_s=0.06, push_samples=128,
+    mechanics_rows=400, answer_samples=64, answer_share=0.05, quick=True,
 )  # fmt: skip
 SPEED_EFFORTS = (replace(_TWO_SPEEDS, speed_share=0.5), _TWO_SPEEDS, ALL_SPEEDS)
 QUICK_NOISE_SAMPLES = 400

@@ -359,6 +359,7 @@ class SpeedStage:
             settle_s=loop.settle_s,
             first_s=2.0 * loop.settle_s,
             window_s=self.effort.window_s,
+            longest_s=self.effort.longest_s,
             per_ampere_rad_s2=per_ampere,
             acceleration_rad_s2=per_ampere * i_run,
             shares=self.effort.shares,
