@@ -156,8 +156,10 @@ QUICK_ROTATION: Rotation = (0.35, math.radians(30.0), rotation.QUICK_DWELL_S, 0.
 """Current, step, dwell and ramp of a slow turn that is tried before :data:`ROTATIONS`: what swings with it takes
 those. It serves pole pairs and direction; the offset comes from the speed run."""
 MECHANICS = ("J_kgm2", "B_nms", "tau_c_nm")
-COASTINGS = (1.0, 2.0, 3.0)
+COASTINGS = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
 """Times of coasting, in pushes, that may be enough (``mechanics_run.COAST_UNITS``)."""
+AS_GOOD = 1.05
+"""Deviation that a coasting is predicted to leave, of that of the longest, which counts as no worse."""
 R_MISFIT, L_MISFIT, PSI_MISFIT = 1.0, 1.5, 1.0
 """Half width that is found at the least effort, of the predicted one: it has the model's misfit, too. Largest
 of 14 random drives, two of them hard: 1.0, 1.45 and 0.93 (``benchmarks/machine_time.py``)."""
@@ -194,14 +196,17 @@ def coasting_for(
 ) -> tuple[MechanicsPlan, Mapping[str, float]]:
     """Return the plan with the shortest coasting whose J, B and tau_c are predicted within an accuracy, and these.
 
-    Unchanged without one, or where a friction is not predicted: it is too small for a short coasting.
+    One that the longest would miss, too, must be as good as that. Unchanged without an accuracy, or where a friction is
+    not predicted: it is too small for a short coasting.
     """
-    for units in COASTINGS if accuracy is not None else ():
-        shorter = replace(plan, coast_units=units)
-        found = predicted(shorter)
-        if len(found) == len(MECHANICS) and COVERAGE_FACTOR * max(found.values()) <= (accuracy or 0.0):
+    whole = predicted(plan)
+    if accuracy is None or len(whole) < len(MECHANICS):
+        return plan, whole
+    for units in COASTINGS:
+        found = predicted(shorter := replace(plan, coast_units=units))
+        if all(value <= max(accuracy / COVERAGE_FACTOR, AS_GOOD * whole[name]) for name, value in found.items()):
             return shorter, found
-    return plan, predicted(plan)
+    return plan, whole
 
 
 def larger_levels(effort: LevelEffort) -> tuple[LevelEffort, ...]:
