@@ -187,8 +187,9 @@ REACH_S, REST_S = 2.0, 1.0
 """Longest time until the speed stands, and until the shaft rests again (s)."""
 SEEN_S = 0.2
 """Shortest window in which the speed is looked at (s), and at least one turn."""
-QUICK_TURNS, QUICK_BAND = 1.0 / 3.0, 0.08
-"""The same with an accuracy, in turns; and the relative distance from the limit at which it begins, within ``MOST``."""
+QUICK_SHARE, QUICK_SEEN_S, QUICK_TURNS, QUICK_BAND = 0.20, 0.10, 1.0 / 3.0, 0.08
+"""The same three with an accuracy, where the run has half of the speed; and the relative distance from the limit at
+which it begins, within ``MOST``."""
 
 
 def show_speed_limit(
@@ -207,10 +208,11 @@ def show_speed_limit(
     pole_pairs : int
         Of the machine.
     quick : bool
-        Whether a third of a turn is enough to look at, by shorter looks; the shaft then coasts on return.
+        Whether a third of a turn at more speed is enough to look at, by shorter looks; the shaft then coasts on return.
     """
     look_s = QUICK_LOOK_S if quick else LOOK_S
-    kept = limit_speed(SHARE * largest_rad_s)
+    share, seen_s, turns = (QUICK_SHARE, QUICK_SEEN_S, QUICK_TURNS) if quick else (SHARE, SEEN_S, 1.0)
+    kept = limit_speed(share * largest_rad_s)
     if kept is None:
         return None
     try:
@@ -219,8 +221,7 @@ def show_speed_limit(
         drive.command_speed(asked)
         band = (QUICK_BAND if quick else COAST_BAND) * kept * pole_pairs
         reach(drive, kept * pole_pairs, limit_s=REACH_S, band_rad_s=band, look_s=look_s)
-        turn_s = (QUICK_TURNS if quick else 1.0) * 2.0 * math.pi / kept
-        periods = math.ceil(max(SEEN_S, turn_s) / drive.period_s)
+        periods = math.ceil(max(seen_s, turns * 2.0 * math.pi / kept) / drive.period_s)
         seen = abs(drive.average(("omega_e_rad_s",), periods)["omega_e_rad_s"]) / pole_pairs
         drive.command_speed(0.0)
         if not quick:

@@ -124,7 +124,8 @@ def test_the_speed_limit_is_shown_to_act(name: str, quick: bool, tmp_path: Path)
             assert rig.session.dictionary["cia402.max_speed"].number() == limit, "the envelope's holds again"
             assert not rig.energised
         assert shown is not None and shown.proven and "speed limit proven" in str(shown) and not unproven(shown)
-        assert shown.asked == pytest.approx(OVER * shown.kept) and shown.kept <= 0.1 * ENVELOPE.speed_max_rad_s
+        assert shown.asked == pytest.approx(OVER * shown.kept)
+        assert shown.kept <= (0.2 if quick else 0.1) * ENVELOPE.speed_max_rad_s
         assert shown.seen == pytest.approx(shown.kept, rel=SHOWN)
         assert rig.memory() == before
 
