@@ -338,16 +338,16 @@ class GuardedDrive:
         return self._drive.take(Recording(signals, samples, decimation, move=move), self.wait)
 
     def wait(self, seconds: float) -> None:
-        """Let time pass, looking at the machine whenever the last look is as old as :data:`WATCH_S`."""
+        """Let time pass, looking at the machine in between."""
         clock = self._node.connection.clock
         end = clock.now() + seconds
         while True:
             left = end - clock.now()
-            due = self._looked_s + WATCH_S - clock.now() if self._drive.may_be_energised else WATCH_S
-            self._drive.wait(max(min(left, due), 0.0))
-            if self._drive.may_be_energised and due <= left:
+            step = min(left, WATCH_S)
+            self._drive.wait(max(step, 0.0))
+            if self._drive.may_be_energised:
                 self._watch()
-            if left <= due:
+            if left <= WATCH_S:
                 return
 
     # ---- limits ---------------------------------------------------------------------------------

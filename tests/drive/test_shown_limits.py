@@ -7,7 +7,6 @@ import math
 from pathlib import Path
 from typing import cast
 
-import numpy as np
 import pytest
 
 from pmsmtool.drive.guard import WATCH_S, GuardedDrive, guarded
@@ -173,18 +172,3 @@ def test_a_value_that_is_no_number(name: str, tmp_path: Path) -> None:
         with opened(name, tmp_path) as rig:
             show = rig.show_current if what == "current" else rig.show_turning
             stopped(rig, ENVELOPE, lambda guard: show(math.nan), what, WATCH_S + STOP_S)  # noqa: B023
-
-
-def test_short_waits_are_looked_into_as_often_as_long_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A look takes a millisecond of the bus: after each of many short waits it was a third of a swing's time."""
-    looks: list[float] = []
-    watch = GuardedDrive._watch
-    with opened("full", tmp_path) as rig:
-        monkeypatch.setattr(GuardedDrive, "_watch", lambda self: looks.append(rig.clock.now()) or watch(self))
-        with guarded(rig.drive, ENVELOPE) as guard:
-            guard.enable()
-            looks[:] = [rig.clock.now()]
-            for _ in range(200):
-                guard.wait(0.003)
-    gaps = np.diff(looks)
-    assert len(gaps) >= 6 and np.max(gaps) < WATCH_S + STOP_S and np.min(gaps) > 0.9 * WATCH_S
