@@ -53,8 +53,12 @@ TURN_S = 0.6
 TURN_DWELL_S = 0.015
 SWUNG_RAD = math.pi / 3.0
 """Longest turn by one swing."""
-SWING_LOOK_S, SPANS = 0.003, 8
-"""Time between two looks at a swing (s), and spans of the looks so far: the last two show the speed of the next one."""
+SWING_LOOK_S, LAST_PART = 0.003, 3
+"""Time between two looks at a swing (s), and the last part of these that shows its speed: one of so many."""
+COUNTS_LEAST = 6.0
+"""Steps of the encoder that a rotor turns at least until its speed is looked at."""
+SURE = 5.0
+"""Speed that is one, in standard deviations: 192 and the cube are those of a parabola's slope at its end."""
 STUCK_S, SWING_MOST_S = 0.12, 2.5
 """A rotor that has not moved by then is held by friction, as the current of the slowest loop has come; and the longest
 wait: a load of 26 rotors that needs 100 s to its rated speed has half a swing of 1.9 s."""
@@ -69,6 +73,8 @@ BRAKED_SHARE = 0.25
 """Current while it returns, of that while it leaves: every half swing is half of the one before."""
 BRAKED_S = 20.0
 """Longest braking (s): ten half swings of a load of 50 times the rotor's inertia on the first current (0.7 Hz)."""
+HALF_SWING_LEAST = 3.0
+"""Way of a half swing, of what counts as rest and of a step of the encoder: less is no swing."""
 STILL_SHARE = 0.75
 """Looks that show rest, of those since the shaft was fastest: a swing of 2 degrees is seen at its turning point."""
 SLOW_LOOKS = 4
@@ -103,21 +109,31 @@ def turn_vector(drive: Drive, i_a: float, start_rad: float, end_rad: float, turn
     return steps * TURN_DWELL_S
 
 
-def turns_back(drive: Drive) -> float:
-    """Wait until a rotor that swings is at its turning point, or stands still; return the time (s)."""
+def turns_back(drive: Drive, least_rad: float = 0.0) -> float:
+    """Wait until a rotor that swings is at its turning point, or stands still; return the time (s).
+
+    A parabola through the last third of the looks shows its speed, and what becomes of it until the current is there:
+    differences of a few looks at a slow rotor are steps of its encoder. ``least_rad`` is a way of the shaft that must
+    lie behind it, with its sign; 0 where that is not known.
+    """
     first = drive.live("theta_m_rad")
-    ways, waited, fastest = [0.0], 0.0, 0.0
-    while waited < SWING_MOST_S and (max(ways) > REST_SPAN_RAD or waited < STUCK_S):
+    ways, waited, moved, fastest, count = [0.0], 0.0, 0.0, 0.0, math.inf
+    while waited < SWING_MOST_S and (moved > REST_SPAN_RAD or waited < STUCK_S):
         drive.wait(SWING_LOOK_S)
         waited += SWING_LOOK_S
-        ways.append(abs(math.remainder(drive.live("theta_m_rad") - first, 2.0 * math.pi)))
-        span = max(1, len(ways) // SPANS)
-        if len(ways) <= 2 * span or max(ways) <= REST_SPAN_RAD:
+        way = math.remainder(drive.live("theta_m_rad") - first, 2.0 * math.pi)
+        moved = max(moved, abs(way))
+        ways.append(math.copysign(way, way * least_rad) if least_rad else abs(way))
+        count = min(count, abs(ways[-1] - ways[-2]) or math.inf)
+        last = ways[-max(LOOKS, len(ways) // LAST_PART) :]
+        if len(last) < LOOKS or max(ways) <= max(REST_SPAN_RAD, COUNTS_LEAST * count, abs(least_rad)):
             continue
-        speed, before = ((ways[k] - ways[k - span]) / span for k in (-1, -1 - span))
-        fastest = max(fastest, speed)
-        next_speed = speed + (speed - before) * (0.5 + 1.0 / span)
-        if next_speed <= 0.0 and speed < 0.5 * fastest:
+        t = np.arange(1.0 - len(last), 1.0)
+        bend, speed, now = np.polyfit(t, last, 2)
+        noise = max(float(np.std(np.polyval((bend, speed, now), t) - last)), 0.3 * count)
+        if speed > SURE * noise * math.sqrt(192.0 / len(last) ** 3):
+            fastest = max(fastest, speed)
+        if speed + 2.0 * bend <= 0.0 and speed < 0.5 * fastest:
             break
     return waited
 
@@ -130,16 +146,16 @@ def come_to_rest(drive: Drive, i_a: float, angle_rad: float, *, limit_s: float =
     """
     periods = max(1, round(0.25 * LOOK_S / drive.period_s))
     seen: list[float] = []
-    waited, way, fastest, fastest_at, shown_at, turned_at, slow, small = 0.0, 0.0, 0.0, 0, 0, 0, False, False
+    waited, way, fastest, count, slow, small = 0.0, 0.0, 0.0, math.inf, False, False
+    fastest_at, shown_at, turned_at = 0, 0, 0
     while waited < limit_s and not _rests(seen, shown_at):
         drive.wait(LOOK_S)
         waited += LOOK_S
         seen.append(drive.average(("theta_m_rad",), periods)["theta_m_rad"])
         before, way = way, seen[-1] - seen[-2] if len(seen) > 1 else 0.0
-        turned = way * before <= 0.0
-        if turned:
-            shown_at = fastest_at if fastest > REST_SPAN_RAD / LOOKS else shown_at
-            slow, turned_at = len(seen) - turned_at > SLOW_LOOKS, len(seen)
+        turned, count = way * before <= 0.0, min(count, abs(way) or math.inf)
+        if turned and abs(seen[-1] - seen[turned_at]) > HALF_SWING_LEAST * max(REST_SPAN_RAD, count):
+            slow, shown_at, turned_at = len(seen) - turned_at > SLOW_LOOKS, fastest_at, len(seen) - 1
         if turned or abs(way) > fastest:
             fastest, fastest_at = abs(way), len(seen)
         returns = slow and (turned or (small and len(seen) == fastest_at))
@@ -200,6 +216,8 @@ LINE_ROWS = 5
 """Rows of a line that shows where a rotor is beside its vector."""
 OFF_MOST_RAD = math.radians(30.0)
 """Largest angle of that: more is no swing."""
+WAY_LEAST = 0.4
+"""Way after which a rotor may turn back, of the expected one: one that swings the other way first is not there yet."""
 FASTEST_SWING_RAD_S = 105.0
 """Of 400 random drives on 0.35 of the test current: a rotor that swings a step is fastest halfway, by half of it."""
 SWINGS_MOST_S = 100.0
@@ -337,27 +355,27 @@ def _step(
     """
     waited = plan.dwell_s
     if waited is None:
-        drive.command_current(plan.i_a, 0.0, fixed_angle_rad=angle - 0.5 * (way - _off_vector_rad(seen)))
-        waited = turns_back(drive)
+        off, turned = _followed(seen)
+        drive.command_current(plan.i_a, 0.0, fixed_angle_rad=angle - 0.5 * (way - off))
+        waited = turns_back(drive, WAY_LEAST * turned * (way - off))
     drive.command_current(plan.i_a, 0.0, fixed_angle_rad=angle)
     if plan.dwell_s is not None:
         drive.wait(waited)
     return _row(drive, angle), waited
 
 
-def _off_vector_rad(rows: Sequence[Mapping[str, float]]) -> float:
-    """Return how far a rotor stands off its vector (rad electrical), by a line through all rows so far.
+def _followed(rows: Sequence[Mapping[str, float]]) -> tuple[float, float]:
+    """Return how far a rotor stands off its vector (rad electrical), and its way (mechanical) of the vector's.
 
-    A swing that a step leaves is in all later ones, and cogging makes it grow: without it a load of 8 rotors was 37
-    degrees off after a turn and half a turn back, with it up to 10.
+    By a line through the rows so far. A swing that a step leaves is in all later ones, and cogging makes it grow: a
+    load of 8 rotors was 37 degrees off after a turn and half a turn back, with the swing taken out up to 10.
     """
-    if len(rows) < LINE_ROWS:
-        return 0.0
     imposed, theta = (np.array([row[name] for row in rows]) for name in ("theta_imposed_rad", "theta_M_rad"))
     if np.ptp(theta) < REST_SPAN_RAD:
-        return 0.0
-    off = np.polyval(np.polyfit(theta, imposed, 1), theta[-1]) - imposed[-1]
-    return float(np.clip(off, -OFF_MOST_RAD, OFF_MOST_RAD))
+        return 0.0, 0.0
+    slope, start = np.polyfit(theta, imposed, 1)
+    off = slope * theta[-1] + start - imposed[-1] if len(rows) >= LINE_ROWS else 0.0
+    return float(np.clip(off, -OFF_MOST_RAD, OFF_MOST_RAD)), float(1.0 / slope)
 
 
 def _row(drive: Drive, angle: float) -> dict[str, float]:

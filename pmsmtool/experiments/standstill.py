@@ -323,8 +323,8 @@ def hold_pairs(
     turn_s : float or None
         Time of a turn (s); None: as long as the rotor swings.
     quick : bool
-        Whether the rows also have the angles of vector and encoder, the vector goes on by 60 degrees from pair to pair,
-        and a swing is braked.
+        Whether the rows also have the angles of vector and encoder, and the vector goes on by 60 degrees from pair to
+        pair.
     half : int or None
         Control periods of half a window; None: whole periods of a link's ripple.
     """
@@ -353,7 +353,7 @@ def hold_pairs(
                 stood = second["theta_m_rad"] if quick else math.inf
                 if not moved and missed <= PAIR_ARRIVED * current:
                     break
-                if quick and n > 1 and moved:
+                if n > 1 and moved:
                     elapsed += brake(drive, currents_a[1], current, angle)
                     turn_s = SWINGING_TURN_S
             times[len(rows) :] = [elapsed]
@@ -466,7 +466,7 @@ def hold_levels(drive: Drive, plan: LevelPlan) -> Trace:
                 stood = second["theta_m_rad"]
             if not moved:
                 break
-            if plan.quick and k > 1 and turned >= REST_RAD:
+            if k > 1 and turned >= REST_RAD:
                 elapsed += brake(drive, largest, abs(level), angle)
                 turn_s = SWINGING_TURN_S
         row = {name: 0.5 * (first[name] + second[name]) for name in MEANS}

@@ -83,13 +83,13 @@ ROTATIONS: tuple[Rotation, ...] = (
     (0.35, rotation.SWUNG_RAD, None, 0.0),
     (0.18, rotation.STEP_RAD, 0.03, 3.0 * rotation.RAMP_S),
     (0.09, rotation.STEP_RAD, 0.03, 4.0 * rotation.RAMP_S),
-    (0.7, rotation.SWUNG_RAD, None, 0.0),
+    (0.7, rotation.STEP_RAD, 0.06, 4.0 * rotation.RAMP_S),
 )
 """Current, of the test current, largest step (rad), time per step and ramp (s) of every try. Above psi/(L_q - L_d) a d
 current is no stable position: a reluctance machine follows a smaller vector only, and swings longer on it. Those with
 longer ramps have another speed, too, for a rotor that swings with the first. Without a time per step the rotor swings
-from step to step: a heavy one swings behind every vector that turns by itself. The last is for friction that holds the
-rotor off a smaller vector."""
+from step to step: a heavy one swings behind every vector that turns by itself. The last is for friction and inertia
+that hold the rotor off a smaller vector."""
 
 
 @dataclass(frozen=True, slots=True)
