@@ -28,7 +28,7 @@ CASES: dict[str, dict[str, Value]] = {
     "both": {"encoder_reversed": True, "leads_swapped": True},
 }
 LEVELS = {
-    "full": ("", ("poles", "L", "--accuracy", "0.01")),
+    "full": ("", ("poles", "L", "--accuracy", "0.02")),
     "inject": ("&level=inject", ("poles", "L")),
     "recorder": ("&level=recorder", ("psi",)),
     "standard": ("&drive=cia402", ("encoder", "poles")),
