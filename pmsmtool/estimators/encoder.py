@@ -37,7 +37,7 @@ PER_TURN_LEAST_RAD = 2e-3
 PER_TURN_ORDERS = 8
 """Highest order per turn that shows how much of the following error is no encoder's."""
 PER_TURN_ROWS = 2
-"""Rows of a way, of the numbers that are fitted, from which on it shows an error per turn."""
+"""Rows of a turn per number that is fitted; one with fewer shows no error once or twice per turn."""
 PER_TURN_SURE = 4.0
 """Error of the encoder once or twice per turn (mechanical) from which on it is told, and how much more of it both
 directions have in common than they differ by: what a swinging rotor or friction shows differs. Of 22 random drives

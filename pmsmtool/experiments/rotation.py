@@ -58,7 +58,8 @@ SWING_LOOK_S, LAST_PART = 0.003, 3
 COUNTS_LEAST = 6.0
 """Steps of the encoder that a rotor turns at least until its speed is looked at."""
 SURE = 5.0
-"""Speed that is one, in standard deviations: 192 and the cube are those of a parabola's slope at its end."""
+"""Standard deviations from which on a speed is one. A parabola's slope at its end, through n looks with noise s, has
+s sqrt(192 / n^3)."""
 STUCK_S, SWING_MOST_S = 0.12, 2.5
 """A rotor that has not moved by then is held by friction, as the current of the slowest loop has come; and the longest
 wait: a load of 26 rotors that needs 100 s to its rated speed has half a swing of 1.9 s."""

@@ -556,7 +556,8 @@ class Measurement:
         for share, step_rad, dwell_s, ramp_s in self._effort.rotations:
             step, dwell = rotation.step_within(step_rad, dwell_s, self.limits.omega_max_rad_s)
             plan = rotation.RotationPlan(share * self.limits.I_test_apk, step, dwell, ramp_s=ramp_s)
-            self.say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A")
+            how = "" if dwell is not None else ", led by the rotor's own swings"
+            self.say(f"pole pairs, direction, offset: one slow turn each way with {plan.i_a:.3g} A{how}")
             turns = rotation.rotate_vector(self.drive, plan, start_rad=start_rad)
             self._keep_turns(turns)
             start_rad = 0.0  # where a turn ends
@@ -564,7 +565,7 @@ class Measurement:
             try:
                 found = estimate_encoder(*turns)
             except IdentificationError as error:
-                if error.reason not in OFF_THE_VECTOR:
+                if error.reason not in OFF_THE_VECTOR and dwell is not None:  # swings end after a time, turned or not
                     raise
                 with contextlib.suppress(IdentificationError):
                     jumped.append((estimate_encoder(*turns, JUMP_LIMIT_RAD), turns))

@@ -248,6 +248,19 @@ def turned(offset_rad: float, jumps_rad: float) -> tuple[Trace, Trace]:
     return runs[0], runs[1]
 
 
+def test_swings_that_take_too_long_for_a_turn_leave_the_other_tries(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They end after 100 s, with E_EXCITATION for a third of a turn: the encoder was refused, and all behind it."""
+    whole = turned(0.0, 0.1)
+    part = tuple(run.rows(slice(0, 50)) for run in whole)
+    left = iter([turned(0.0, 1.1), part, whole])
+    monkeypatch.setattr("pmsmtool.experiments.rotation.rotate_vector", lambda *_, **__: next(left))
+    said: list[str] = []
+    limits = Limits(1.0, 1.2, 300.0, 100.0)
+    measurement = Measurement(SwingingRotor(20.0), limits, lambda *_: None, said.append)  # type: ignore[arg-type]
+    assert measurement._rotation(0.0).pole_pairs.value == POLE_PAIRS
+    assert [line.endswith("own swings") for line in said] == [False, True, False]
+
+
 @pytest.mark.parametrize(("of_the_largest", "used"), [(0.75, 1), (0.02, 4)])
 def test_the_largest_current_is_not_trusted_where_it_puts_a_jumping_rotor_beside_its_vector(
     of_the_largest: float, used: int, monkeypatch: pytest.MonkeyPatch
