@@ -98,10 +98,10 @@ def plan_frequency_response(
 def bounded_sequence(k: int) -> list[float]:
     """Return the signs of record k, shape (BITS,), whose sum starts and ends at zero and is never beyond BITS_AHEAD."""
     signs, ahead = np.random.default_rng(k).choice([-1.0, 1.0], BITS), 0.0
-    for k, left in enumerate(range(BITS, 0, -1)):
-        if abs(ahead + signs[k]) > min(BITS_AHEAD, left - 1):
-            signs[k] = -signs[k]
-        ahead += signs[k]
+    for bit, left in enumerate(range(BITS, 0, -1)):
+        if abs(ahead + signs[bit]) > min(BITS_AHEAD, left - 1):
+            signs[bit] = -signs[bit]
+        ahead += signs[bit]
     return [float(sign) for sign in signs]
 
 

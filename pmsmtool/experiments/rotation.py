@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: MIT
-"""Turn a current vector slowly forward and back: the rotor follows, and the encoder is counted.
+"""Turn a current vector slowly forward and back: the rotor follows while the encoder, or the Hall wires, are read.
 
-A rotor that a current vector turns slowly over a turn and back, while the Hall wires are read.
-
-Lead a current vector onto a rotor that stands anywhere, and turn it so that the rotor goes with it without a swing.
+Before, the vector is led onto a rotor that stands anywhere, and turns so that the rotor goes with it without a swing.
 
 Current that is switched on at some angle lets the rotor fall onto it from up to half an electrical turn away, and with
 little friction it swings for seconds: one part in a hundred of the rated torque takes 3 degrees of it per half swing

@@ -215,6 +215,7 @@ class SpeedStage:
         target = PUSH_SPEED_SHARE * limits.omega_max_rad_s
         rate = self._acceleration_per_ampere(target, pole_pairs)
         current = PUSH_SHARE * limits.I_test_apk
+        target = min(target, rate * current * RAMP_S)  # a heavy shaft gets little further in the flux run, too
         decimation = max(1, round(target / (rate * current) / (samples * self.drive.period_s)))
         reached = rate * current * samples * decimation * self.drive.period_s
         if reached > PUSH_END_SHARE * limits.omega_max_rad_s:  # within the shortest record

@@ -102,11 +102,17 @@ def test_a_swinging_shaft_hides_no_limit_and_shows_none(
     assert LimitShown(3.17, 2.116, given, current_limit.MOST * 2.116).acts == (scale == 1.0)
 
 
-def speed_shown(rig: Rig, guard: GuardedDrive, *, quick: bool = False) -> LimitShown | None:
+TURNING_A, TURNING_S, SLOW_RPM_PER_S = 3.0, 0.2, 150.0
+"""A current, and its time, that leave a shaft turning; a ramp that takes longer to stop it than the trial waits."""
+
+
+def speed_shown(
+    rig: Rig, guard: GuardedDrive, *, quick: bool = False, acceleration_rpm_per_s: float = 1500.0
+) -> LimitShown | None:
     machine = load_machine_file(machine_path("interior-2k2"))
     J = machine.machine.J_kgm2 or 0.0
     loop = {"K_p_nms_per_rad": 50.0 * J, "K_i_nm_per_rad": 625.0 * J, "tau_max_nm": 3.0}
-    loop["acceleration_rpm_per_s"] = 1500.0
+    loop["acceleration_rpm_per_s"] = acceleration_rpm_per_s
     guard.write({**set_up_values(machine), **{f"speed.{name}": value for name, value in loop.items()}})
     return show_speed_limit(guard, guard.limit_speed, ENVELOPE.speed_max_rad_s, POLE_PAIRS, quick=quick)
 
@@ -127,6 +133,20 @@ def test_the_speed_limit_is_shown_to_act(name: str, quick: bool, tmp_path: Path)
         assert shown.kept <= (0.2 if quick else 0.1) * ENVELOPE.speed_max_rad_s
         assert shown.seen == pytest.approx(shown.kept, rel=SHOWN)
         assert rig.memory() == before
+
+
+@pytest.mark.chain
+def test_a_shaft_that_still_turns_is_stopped_first(tmp_path: Path) -> None:
+    """A heavy shaft kept 4 times the limit from the pushes before, longer than the trial waits for a speed."""
+    with opened("full", tmp_path) as rig, guarded(rig.drive, ENVELOPE) as guard:
+        guard.enable()
+        guard.command_current(0.0, -TURNING_A)
+        guard.wait(TURNING_S)
+        before = guard.live("omega_e_rad_s") / POLE_PAIRS
+        guard.disable()
+        shown = speed_shown(rig, guard, acceleration_rpm_per_s=SLOW_RPM_PER_S)
+        assert shown is not None and before < -3.0 * shown.kept
+        assert shown.proven and shown.seen == pytest.approx(shown.kept, rel=SHOWN)
 
 
 @pytest.mark.chain
