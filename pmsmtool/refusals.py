@@ -49,6 +49,12 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
         "take away what pulls on the shaft, or lower the current (--i-max)",
     ),
     (
+        "E_NO_MAGNET",
+        "the rotor follows a vector, but a q current makes no torque in it",
+        "a reluctance machine without magnets; L_d is that of the axis that a vector pulls onto itself",
+        "use R_s, pole pairs and inductances of this run; control is designed for machines with magnets only",
+    ),
+    (
         "E_MAGNET_CHANGED",
         "the flux linkage after the pulses of the flux map is not the one before them",
         "magnets that the d current of the pulses has demagnetised in part",

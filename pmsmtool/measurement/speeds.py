@@ -57,6 +57,11 @@ GROWTH, LITTLE_SHARE, GROWN_SHARE, PUSHES_MOST = (2.0, 1.5), 0.1, 0.55, 13
 """By what the first current grows until the shaft answers, below and above a share of the test current, up to which it
 does, and how often. Twice a current that friction of 37 % of the rated torque held brought a shaft to its speed limit.
 """
+PUSH_MOST_S = 20.0
+"""Longest of them: a load of 26 rotors, 102 s from its rated speed, answers within 18 s, friction of 6 % included."""
+NO_MAGNET_RATIO = 1.2
+"""L_d over L_q from which on a rotor that followed a vector, and no q current turns, has no magnets: a vector pulls the
+axis of the larger inductance onto itself. Machines with magnets have 0.2 to 1."""
 SPEED_LOOP_RAD_S = 25.0
 RUN_I_D_SHARE, RUN_I_D_MOST = 0.45, 0.8
 """Largest d current of the flux run, of the test current: a third of it is still beyond the inverter's knee."""
@@ -187,7 +192,7 @@ class SpeedStage:
             }
         )
         self.drive.enable()
-        psi, J = self._pushes(resistance, pole_pairs)
+        psi, J = self._pushes(resistance, pole_pairs, L)
         plan = self._speeds(psi, J, pole_pairs, L, resistance.V_dead_v)
         if self.effort == ALL_SPEEDS or enough():
             return plan
@@ -208,12 +213,12 @@ class SpeedStage:
         )
         speed_run.reach(self.drive, 0.0, limit_s=1.0, band_rad_s=REST_SHARE * plan.omega_max_rad_s * pole_pairs)
 
-    def _pushes(self, resistance: ResistanceResult, pole_pairs: int) -> tuple[float, float]:
+    def _pushes(self, resistance: ResistanceResult, pole_pairs: int, L: tuple[float, float]) -> tuple[float, float]:
         """Push the rotor there and back; return flux linkage (Wb) and inertia (kg m2), good for a speed controller."""
         limits, samples = self.limits, self.effort.push_samples
         self.say("flux and inertia, first estimate: short torque pulses both ways")
         target = PUSH_SPEED_SHARE * limits.omega_max_rad_s
-        rate = self._acceleration_per_ampere(target, pole_pairs)
+        rate = self._acceleration_per_ampere(target, pole_pairs, L)
         current = PUSH_SHARE * limits.I_test_apk
         target = min(target, rate * current * RAMP_S)  # a heavy shaft gets little further in the flux run, too
         decimation = max(1, round(target / (rate * current) / (samples * self.drive.period_s)))
@@ -251,10 +256,11 @@ class SpeedStage:
             )
         return psi, torque_per_ampere(pole_pairs, psi) / rate
 
-    def _acceleration_per_ampere(self, target: float, pole_pairs: int) -> float:
+    def _acceleration_per_ampere(self, target: float, pole_pairs: int, L: tuple[float, float]) -> float:
         """Return the acceleration per ampere beyond friction (rad/s2/A), from pushes that grow until the shaft answers.
 
-        A second push, of another current, tells what friction took of both.
+        A second push, of another current, tells what friction took of both. Raises IdentificationError:
+        ``E_EXCITATION``, or ``E_NO_MAGNET`` by the inductances ``L``: no push moves the shaft.
         """
         current, seconds = FIRST_SHARE * self.limits.I_test_apk, FIRST_S
         for _ in range(PUSHES_MOST):
@@ -270,8 +276,17 @@ class SpeedStage:
                 return change / gained
             if current < GROWN_SHARE * self.limits.I_test_apk:
                 current *= GROWTH[current > LITTLE_SHARE * self.limits.I_test_apk]
+            elif seconds < PUSH_MOST_S:
+                seconds = min(PUSH_MOST_S, seconds * min(4.0, 0.5 * target / max(change, 1e-3 * target)))
             else:
-                seconds *= min(4.0, 0.5 * target / max(change, 1e-3 * target))
+                break
+        if L[0] > NO_MAGNET_RATIO * L[1]:
+            raise refuse(
+                "E_NO_MAGNET",
+                f"{current:.3g} A of q current do not turn the rotor that followed a vector; "
+                f"L_d is {L[0] / L[1]:.2g} times L_q",
+                stage="speed run",
+            )
         raise refuse(
             "E_EXCITATION",
             "the shaft does not move under a torque pulse",

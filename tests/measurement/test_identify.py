@@ -150,6 +150,19 @@ def test_a_reluctance_machine_follows_a_smaller_and_slower_vector(seed: int, tmp
     assert abs(off) < COARSE_RAD, math.degrees(off)
 
 
+def test_a_machine_without_magnets_is_named_and_the_rest_identified(tmp_path: Path) -> None:
+    """A vector pulls the axis of the larger inductance onto itself, so that is L_d; both within 0.2 %."""
+    with Connection(PmsmSimBus(f"{CHANNEL}&psi_f_wb=0&L_q_h=0.12")) as connection:
+        drive = CanopenDrive(connection, 1)
+        run, stage = identified(drive, tmp_path, ("poles", "R", "L", "psi"))
+        drive.close()
+    assert stage.status == "partial" and stage.refused["psi"].startswith("E_NO_MAGNET")
+    found = load_machine_file(run.path / MACHINE)
+    assert found.machine.pole_pairs == 3 and {"R_s_ohm", "L_d_h", "L_q_h"} <= set(found.estimates)
+    assert found.machine.L_d_h == pytest.approx(0.12, rel=0.01)
+    assert found.machine.L_q_h == pytest.approx(0.036, rel=0.01)
+
+
 @pytest.mark.parametrize(("factor", "quantities"), [(0.01, ("poles",)), (1000.0, ("poles", "L"))])
 def test_the_gains_of_another_motor_serve_nobody(factor: float, quantities: tuple[str, ...], tmp_path: Path) -> None:
     """Too weak, no phase looked connected; too strong, the drive tripped, or its bias rang. They are put back."""

@@ -13,9 +13,17 @@ import pytest
 from numpy.typing import NDArray
 
 from pmsmtool.drive.port import Excitation
+from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.inverter_error import InverterCurve
 from pmsmtool.measurement.limits import Limits
-from pmsmtool.measurement.speeds import PUSH_END_SHARE, PUSH_REACHED, PUSH_SHARE, PUSH_SPEED_SHARE, SpeedStage
+from pmsmtool.measurement.speeds import (
+    PUSH_END_SHARE,
+    PUSH_MOST_S,
+    PUSH_REACHED,
+    PUSH_SHARE,
+    PUSH_SPEED_SHARE,
+    SpeedStage,
+)
 from pmsmtool.trace import Trace
 
 POLE_PAIRS, PSI, RATE, R, V_DEAD = 4, 0.05, 400.0, 0.2, 10.0
@@ -107,7 +115,7 @@ def pushed(
     drive.held_a = held_a
     stage = SpeedStage(drive, LIMITS, kept.__setitem__, lambda text: None)
     resistance: Any = SimpleNamespace(R_measured=SimpleNamespace(value=R), V_dead_v=V_DEAD, curve=curve)
-    psi, J = stage._pushes(resistance, POLE_PAIRS)
+    psi, J = stage._pushes(resistance, POLE_PAIRS, (1e-3, 1e-3))
     assert drive.fastest < 1.02 * PUSH_END_SHARE * LIMITS.omega_max_rad_s  # the drive ends it a row later
     return kept, psi, J
 
@@ -169,5 +177,21 @@ def test_a_second_push_in_which_no_more_current_flowed_tells_no_inertia(
             return answers[len(pushed_a) - 1]
 
     stage = Answering(SimpleNamespace(), LIMITS, lambda name, trace: None, lambda text: None)  # type: ignore[arg-type]
-    assert stage._acceleration_per_ampere(10.0, POLE_PAIRS) == pytest.approx(rate)
+    assert stage._acceleration_per_ampere(10.0, POLE_PAIRS, (1e-3, 1e-3)) == pytest.approx(rate)
     assert pushed_a == sorted(pushed_a) and pushed_a[-1] <= LIMITS.I_test_apk
+
+
+@pytest.mark.parametrize(("L_d", "reason"), [(1.1e-3, "E_EXCITATION"), (1.3e-3, "E_NO_MAGNET")])
+def test_a_rotor_that_no_push_turns_has_a_brake_or_no_magnets(L_d: float, reason: str) -> None:
+    """A reluctance machine was pushed four times longer each time, until the run's 600 s were over."""
+    seconds_of = []
+
+    class Still(SpeedStage):
+        def _there_and_back(self, i_q_a: float, seconds: float, pole_pairs: int) -> tuple[float, float]:
+            seconds_of.append(seconds)
+            return 1e-9, i_q_a * seconds
+
+    stage = Still(SimpleNamespace(), LIMITS, lambda name, trace: None, lambda text: None)  # type: ignore[arg-type]
+    with pytest.raises(IdentificationError, match=reason):
+        stage._acceleration_per_ampere(10.0, POLE_PAIRS, (L_d, 1e-3))
+    assert max(seconds_of) == PUSH_MOST_S and 2.0 * sum(seconds_of) < 60.0
