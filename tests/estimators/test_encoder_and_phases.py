@@ -323,6 +323,11 @@ def test_unequal_pairs_and_unequal_sensors_are_told_apart(found: Trace, reason: 
     assert caught.value.reason == reason
 
 
+def test_sensors_at_the_limit_are_corrected() -> None:
+    """What is corrected is known to a twentieth of it: 5.2 % read may be 4.7."""
+    assert check_pairs(pairs((2.0, 2.0, 2.0), gains=(1.0, 0.95, 1.0)), NOISE, STEP).mismatch.corrected
+
+
 def test_unequal_sensors_are_named_with_their_gains() -> None:
     named = r"differ by 6\.2 % \(a \+2\.1 %, b -4\.2 %, c \+2\.1 % of their mean\), limit 5 %"
     with pytest.raises(IdentificationError, match=named):
