@@ -145,6 +145,12 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
         "free the shaft, raise the current (--i-max), check the increments per turn",
     ),
     (
+        "E_NOT_SET_UP",
+        "the drive holds the factory's encoder offset or psi_f, which a held rotor cannot show",
+        "a drive that was not set up for this motor",
+        "free the shaft and `commission`, which measures and stores them; then hold the rotor",
+    ),
+    (
         "E_EXCITATION",
         "the recorded signal does not contain the excitation the method needs",
         "the drive aborted the excitation, or recorded something else",

@@ -37,7 +37,7 @@ from pmsmtool.identification.completed_machine import NEEDED, completed_machine
 from pmsmtool.identification.request import MACHINE, NAMEPLATE, QUANTITIES, IdentifyRequest, Method
 from pmsmtool.identification.verdicts import blocking
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
-from pmsmtool.measurement.by_injection import nameplate_of
+from pmsmtool.measurement.by_injection import nameplate_of, with_own_encoder
 from pmsmtool.measurement.by_pulses import OVER_TORQUE_CONSTANT, measurable
 from pmsmtool.measurement.by_vendor import vendor_line
 from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel
@@ -231,9 +231,7 @@ class LevelStages:
             return known
         if known is None:
             known = nameplate_of(self.drive), SET_UP
-        offset, reverse = (self.drive.read(f"encoder.{name}") for name in ("offset_rad", "reversed"))
-        encoder = replace(known[0].encoder, offset_rad=offset, direction=-1 if reverse else 1)
-        return replace(known[0], encoder=encoder), known[1]
+        return with_own_encoder(known[0], self.drive), known[1]
 
     def _injected(self, request: IdentifyRequest) -> IdentifyRequest:
         """Return a request without what needs an encoder, where the drive has none."""

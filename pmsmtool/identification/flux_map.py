@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING
 
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.map_fit import MagnetFlux
-from pmsmtool.estimators.flux.map_result import FluxMapResult, estimate_flux_map
+from pmsmtool.estimators.flux.map_result import STAGE, FluxMapResult, estimate_flux_map
 from pmsmtool.estimators.flux.map_rows import Frame
 from pmsmtool.machine.flux_map_import import flux_map_csv, flux_map_npz
 from pmsmtool.machine.parameters import Estimate, MachineParameters
 from pmsmtool.npz_file import npz_bytes
+from pmsmtool.params.catalogue import BY_NAME
+from pmsmtool.refusals import refuse
 from pmsmtool.run_directory import Acceptance, RunDirectory
 from pmsmtool.trace import Trace
+from pmsmtool.units import format_quantity
 
 if TYPE_CHECKING:
     from pmsmtool.identification.evaluate import Evaluation
@@ -25,12 +28,43 @@ MAP_FILE = "flux_map.npz"
 MAP_CSV = "flux_map.csv"
 MAP_INTERVALS = "flux_map_intervals.npz"
 
-HELD_FALLBACK = "psi_f of the drive's parameter set: a held rotor shows increments of flux only"
+SET_UP_BY = ("encoder.offset_rad", "motor.psi_f_wb")
+"""Parameters without which a held rotor's map has neither angle nor constant; one with the factory's value was set by
+nobody. Pole pairs and direction tell nothing: many a motor has the factory's."""
+SAME_SHARE = 1e-6
+"""Within this of the factory's value (binary32) it is that."""
 CORRECTION_STD = 0.2
 """Standard deviation of what the map takes psi_f back to zero current by, of that correction: its curvature there."""
 DEVIATION_LIMIT = 0.01
 """Largest rms deviation of all fluxes within the map's current, of their range: a rotor that stood at one angle leaves
 0.6 % for its slots, and of 36 maps of saturated machines none had more than 0.9 %."""
+
+
+def require_set_up(pole_pairs: float, held: Mapping[str, float]) -> None:
+    """Refuse the map of a held rotor where the drive's set cannot tell where its magnets stand, or how strong they are.
+
+    Pulses show increments of flux, and their axes up to a quarter of an electrical turn. A factory set gave a map of
+    interior-2k2 with L_d +41 %, its axes swapped, and one of saturated-pmsyrm with +691 %.
+
+    Parameters
+    ----------
+    pole_pairs : float
+        What the drive holds.
+    held : mapping of str to float
+        The same of :data:`SET_UP_BY`.
+    """
+    unset = [name for name in SET_UP_BY if math.isclose(held[name], BY_NAME[name].default, rel_tol=SAME_SHARE)]
+    if not unset:
+        return
+    told = ", ".join(f"{name} {format_quantity(held[name], BY_NAME[name].unit)}" for name in unset)
+    raise refuse(
+        "E_NOT_SET_UP",
+        f"a held rotor shows neither psi_f nor the d axis, and the drive holds the factory's {told} "
+        f"({pole_pairs:.0f} pole pairs)",
+        stage=STAGE,
+        hint="free the shaft and `commission`, which measures and stores them; or `param set motor.pole_pairs=P "
+        "encoder.offset_rad=RAD motor.psi_f_wb=WB --store` (an offset of 0 as 6.2831853). R and inverter need neither",
+    )
 
 
 def flux_map_of(
@@ -47,6 +81,8 @@ def flux_map_of(
     held = bool(facts["held"])
     drive_offset = float(facts["offset_rad"])
     pole_pairs = int(facts["signed_pole_pairs"])
+    if held:
+        require_set_up(abs(pole_pairs), {SET_UP_BY[0]: drive_offset, SET_UP_BY[1]: float(facts["psi_f_wb"])})
     magnet = MagnetFlux(float(facts["psi_f_wb"]), 0.0)
     to_reference = 0.0
     offset = drive_offset
@@ -58,7 +94,7 @@ def flux_map_of(
         offset = result.offset.value
     elif not held:
         return None
-    return estimate_flux_map(
+    found = estimate_flux_map(
         trains,
         result.noise,
         result.resistance,
@@ -70,6 +106,15 @@ def flux_map_of(
         U_dc_v=U_dc_v,
         sampling=None if result.inductance is None else result.inductance.sampling,
     )
+    if not held:
+        return found
+    turned = math.degrees(found.fit.frame.offset_rad - drive_offset)
+    told = (
+        f"flux map: psi_f {magnet.psi_wb:.4g} Wb, {abs(pole_pairs)} pole pairs and encoder offset {drive_offset:.4g} "
+        "rad are those that the drive holds, not measured: a held rotor shows increments of flux, and its axes to a "
+        f"quarter of an electrical turn (the nearest stand {turned:+.2g} deg from the drive's)"
+    )
+    return replace(found, notes=(told, *found.notes))
 
 
 def map_estimates(result: Evaluation, flux_map: FluxMapResult, traces: Mapping[str, Trace]) -> dict[str, Estimate]:
@@ -79,9 +124,7 @@ def map_estimates(result: Evaluation, flux_map: FluxMapResult, traces: Mapping[s
     and extrapolates, at none.
     """
     facts = traces["map_0"].meta
-    fallback = HELD_FALLBACK if facts["held"] else ""
     found = flux_map.at_rated_current(abs(int(facts["signed_pole_pairs"])), float(facts["I_nom_a"]))
-    found = {name: replace(estimate, fallback=fallback) for name, estimate in found.items()}
     if result.flux is not None:
         psi_f = float(flux_map.flux_map.flux(0.0, 0.0)[0])
         std = math.hypot(result.flux.psi_f.std, CORRECTION_STD * (psi_f - result.flux.psi_f.value))

@@ -87,7 +87,16 @@ def nameplate_of(drive: CanopenDrive, name: str = "") -> MachineFile:
         T_winding_max_c=read("protection.T_winding_max_c"),
     )
     source = "parameter set and ratings of the drive; the measured values are in [estimate]"
-    return with_own_halls(MachineFile(name, machine, inverter, limits=limits, provenance={"source": source}), read)
+    known = MachineFile(name, machine, inverter, limits=limits, provenance={"source": source})
+    return with_own_halls(with_own_encoder(known, drive), read)
+
+
+def with_own_encoder(known: MachineFile, drive: CanopenDrive) -> MachineFile:
+    """Return a machine file with the encoder's offset and direction that the drive holds, where it shows them."""
+    offset, reverse = (drive.parameters.held_value(f"encoder.{name}") for name in ("offset_rad", "reversed"))
+    if offset is None or reverse is None:
+        return known
+    return replace(known, encoder=replace(known.encoder, offset_rad=offset, direction=-1 if reverse else 1))
 
 
 def with_own_halls(known: MachineFile, read: Callable[[str], float]) -> MachineFile:
@@ -185,6 +194,8 @@ def plan(task: Task) -> tuple[Envelope, list[str]]:
         require_speed(envelope.speed_max_rad_s, nameplate.machine.top_rpm or 0.0)
     if "rotation" in steps:
         dwell_within(0.0, envelope.speed_max_rad_s)
+    if request.shaft == "locked" and "map" in steps:
+        flux_map.require_own_frame(task.drive.read, nameplate)
     lines = plan_lines(envelope, request, nameplate)
     if "speeds" in steps and (few := few_counts(encoder_counts(task.drive.node), nameplate.machine.pole_pairs)):
         lines.append(f"{few}; it runs slower for that, and psi and J are less accurate")

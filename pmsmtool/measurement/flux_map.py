@@ -9,9 +9,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pmsmtool.drive.port import Drive
+from pmsmtool.errors import Contradiction
 from pmsmtool.estimators.current_sensors import Noise
 from pmsmtool.estimators.resistance import ResistanceResult
 from pmsmtool.experiments import flux_map_scan
+from pmsmtool.identification.flux_map import SET_UP_BY, require_set_up
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.limits import TRIP_SHARE
 from pmsmtool.trace import Trace
@@ -43,6 +45,24 @@ def plan_lines(nameplate: MachineFile) -> list[str]:
         return [PLAN_LINE]
     why = "assumed, the rated current: no i_d_min_apk is stated"
     return [PLAN_LINE, f"d current at most {format_current(rated)} ({why})"]
+
+
+def require_own_frame(read: Callable[[str], float], known: MachineFile) -> None:
+    """Refuse the map of a held rotor where nothing says how its angle becomes that of the magnets.
+
+    Raises IdentificationError: ``E_NOT_SET_UP``, the drive holds the factory's set; Contradiction: its pole pairs are
+    not those of the machine file.
+    """
+    pole_pairs = read("motor.pole_pairs")
+    if round(pole_pairs) != known.machine.pole_pairs:
+        raise Contradiction(
+            f"the drive holds {pole_pairs:.0f} pole pairs and the machine file states {known.machine.pole_pairs}; a "
+            "held rotor cannot show which: nothing was moved, nothing was written",
+            where="motor.pole_pairs",
+            likely="the drive is set up for another motor, or this is the data sheet of another one",
+            hint="free the shaft and `commission`, or correct one of the two",
+        )
+    require_set_up(pole_pairs, {name: read(name) for name in SET_UP_BY})
 
 
 def measure_map(

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ import pytest
 from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.guard import guarded
-from pmsmtool.errors import NotAvailable
+from pmsmtool.errors import Contradiction, IdentificationError, NotAvailable
 from pmsmtool.estimators.current_sensors import Noise, estimate_noise
 from pmsmtool.estimators.flux.map_fit import MagnetFlux
 from pmsmtool.estimators.flux.map_result import estimate_flux_map
@@ -32,7 +34,7 @@ from pmsmtool.machine.machine_file import MachineFile, dump_machine_file, load_m
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.measurement import measure
 from pmsmtool.measurement.by_injection import envelope_of, nameplate_of
-from pmsmtool.measurement.flux_map import IF_SATURATED, measure_map, plan_lines
+from pmsmtool.measurement.flux_map import IF_SATURATED, measure_map, plan_lines, require_own_frame
 from pmsmtool.measurement.identify import identify
 from pmsmtool.measurement.limits import Limits
 from pmsmtool.measurement.measure import Measurement
@@ -156,6 +158,31 @@ def test_a_held_rotor_allows_the_map_and_nothing_that_turns() -> None:
     IdentifyRequest(("R", "map"), shaft="locked").check()
     with pytest.raises(NotAvailable, match="psi"):
         IdentifyRequest(("map", "psi"), shaft="locked").check()
+
+
+FACTORY = {"motor.pole_pairs": 4.0, "encoder.offset_rad": 0.0, "motor.psi_f_wb": float(np.float32(0.41))}
+SET_UP = {"motor.pole_pairs": 3.0, "encoder.offset_rad": 0.35, "motor.psi_f_wb": 0.545}
+
+
+@pytest.mark.parametrize(
+    ("held", "refused"),
+    [
+        (FACTORY, IdentificationError),
+        ({**SET_UP, "encoder.offset_rad": 0.0}, IdentificationError),  # motor data from a plate, no encoder aligned
+        ({**SET_UP, "motor.psi_f_wb": FACTORY["motor.psi_f_wb"]}, IdentificationError),
+        ({**SET_UP, "motor.pole_pairs": 4.0}, Contradiction),
+        ({**SET_UP, "encoder.offset_rad": 6.2831853}, None),  # the same angle as none, and set by somebody
+        ({**SET_UP, "motor.psi_f_wb": 0.0}, None),  # a reluctance machine
+        (SET_UP, None),
+    ],
+)
+def test_a_held_rotor_is_mapped_where_somebody_has_set_its_angle(held: dict[str, float], refused: Any) -> None:
+    base = load_machine_file(machine_path("interior-2k2"))
+    known = replace(base, machine=replace(base.machine, pole_pairs=4 if held is FACTORY else 3))
+    with nullcontext() if refused is None else pytest.raises(refused) as caught:
+        require_own_frame(held.__getitem__, known)
+    if refused is not None:
+        assert caught is not None and "free the shaft and `commission`" in str(caught.value)
 
 
 @pytest.mark.parametrize(
