@@ -297,7 +297,7 @@ def _tell(
 ) -> Mapping[str, Mapping[str, Any]]:
     """Tell what a stage holds, also one that an error ``ended``; return what became of the accuracy asked for."""
     from pmsmtool.identification.request import accuracy_line, accuracy_told
-    from pmsmtool.report.report import total_interval
+    from pmsmtool.report.report import INTEGER, total_interval
     from pmsmtool.report.verdict import on_which_drive
 
     rows = []
@@ -307,12 +307,13 @@ def _tell(
             rows.append((value["name"], told, "no interval", "", "", value.get("method", value["source"])))
             continue
         total = total_interval(value["std"], value["systematic"], value["coverage_factor"])
+        whole = total == 0.0
         rows.append(
             (
                 value["name"],
-                format_estimate(value["value"], total, value["unit"]),
-                format_quantity(value["coverage_factor"] * value["std"], value["unit"], 2),
-                format_quantity(value["systematic"], value["unit"], 2),
+                f"{value['value']:.0f}" if whole else format_estimate(value["value"], total, value["unit"]),
+                INTEGER if whole else format_quantity(value["coverage_factor"] * value["std"], value["unit"], 2),
+                "" if whole else format_quantity(value["systematic"], value["unit"], 2),
                 "" if value["T_c"] is None else f"{value['T_c']:.1f} degC",
                 value["method"],
             )

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from fractions import Fraction
 from typing import Any, Literal
 
 from pmsmtool.estimators.resistance import R_MEASURED
@@ -343,8 +344,10 @@ def _exact(row: Row, *, used: bool) -> Row:
         cause = f"integer ratio {ratio:g}: encoder counts per turn (lines instead of edges, wrong bits)"
     elif ratio == 2.0:
         cause = "ratio 2: poles instead of pole pairs, or encoder counts per turn"
-    else:
-        cause = _OTHER_SET_UP if row.measured is None else _OTHER
+    elif row.measured is None:
+        cause = _OTHER_SET_UP
+    else:  # 10000 counts of 2500 lines stated as 8000: 5 pole pairs of 4
+        cause = f"{_OTHER}, or encoder counts per turn (ratio {Fraction(round(other), round(row.stated))})"
     return replace(row, verdict="contradicts", cause=cause)
 
 

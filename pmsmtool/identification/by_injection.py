@@ -16,6 +16,7 @@ from pmsmtool.identification.cogging import save_cogging
 from pmsmtool.identification.evaluate import Evaluation, evaluate
 from pmsmtool.identification.flux_map import with_map
 from pmsmtool.identification.request import (
+    COUNTS,
     MACHINE,
     NAMEPLATE,
     PREDICTED,
@@ -136,9 +137,9 @@ def evaluation_of(run: RunDirectory, nameplate: MachineFile, request: IdentifyRe
 @lru_cache(maxsize=1)
 def _evaluation(question: _Question) -> Evaluation:
     run, nameplate, request = question.run, question.nameplate, question.request
-    inverter = nameplate.inverter
-    return evaluate(
-        stored_traces(run),
+    inverter, traces = nameplate.inverter, stored_traces(run)
+    found = evaluate(
+        traces,
         inverter.T_s,
         copper=copper_of(nameplate),
         alpha_psi_per_k=nameplate.machine.alpha_psi_per_k,
@@ -147,6 +148,12 @@ def _evaluation(question: _Question) -> Evaluation:
         tolerance=replace(request.tolerance, magnet_per_k=magnet_tolerance_per_k(nameplate.machine)),
         ended=refused_in(run),
     )
+    counts = traces["zero_current"].meta.get(COUNTS)
+    if found.encoder is None or counts is None:
+        return found
+    pairs = found.encoder.pole_pairs
+    told = f"{pairs.method}; by the drive's {counts:.0f} encoder counts per turn, like J, B, tau_c and speeds"
+    return replace(found, encoder=replace(found.encoder, pole_pairs=replace(pairs, method=told)))
 
 
 RESONANCE = ("resonance_hz", "antiresonance_hz", "resonance_zeta")

@@ -348,7 +348,7 @@ def encoder_estimates(found: EncoderResult, traces: Mapping[str, Trace]) -> dict
     """Return pole pairs, direction and offset by the keys of a machine file."""
     direction = Estimate(float(found.direction), 0.0, 0.0, "1", n=found.offset.n, method=found.pole_pairs.method)
     offset = offset_by_turns(found, traces["rotation_forward"], traces["rotation_backward"])
-    return {"pole_pairs": found.pole_pairs, "direction": direction, "offset_rad": offset}
+    return {"pole_pairs": replace(found.pole_pairs, std=0.0), "direction": direction, "offset_rad": offset}
 
 
 def push_estimates(found: PushResult) -> dict[str, Estimate]:

@@ -179,7 +179,7 @@ class Evaluation:
         if self.flux is not None:
             found["psi_f_wb"] = self.map_estimates.get("psi_f_wb", self.flux.psi_f)
         if self.encoder is not None:
-            found["pole_pairs"] = self.encoder.pole_pairs
+            found["pole_pairs"] = replace(self.encoder.pole_pairs, std=0.0)  # an integer, or refused
         if self.offset is not None:
             found["offset_rad"] = self.offset
         if self.mechanics is not None:

@@ -181,6 +181,10 @@ def accuracy_line(facts: Mapping[str, Mapping[str, Any]]) -> str:
     return f"accuracy {100.0 * asked:.3g} % (95 %, without the sensors' part): {', '.join(parts)}; {verdict}"
 
 
+COUNTS = "counts_per_turn"
+"""Key of the zero-current trace's ``meta``: the encoder's counts per turn, as the drive states them."""
+
+
 class Method(StrEnum):
     """Ways to a quantity, as ``identify --method`` names them."""
 

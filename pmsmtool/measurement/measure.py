@@ -45,7 +45,7 @@ from pmsmtool.experiments.rotation import turn_vector
 from pmsmtool.identification.evaluate import Evaluation, evaluate, flux_of, inductance_of, resistance_of, tolerance_on
 from pmsmtool.identification.phase_check import PhaseCheck, check_pairs, check_phases
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
-from pmsmtool.identification.request import LEFT_OUT, entry, steps_of
+from pmsmtool.identification.request import COUNTS, LEFT_OUT, entry, steps_of
 from pmsmtool.identification.value_verdict import BEND_NOTED
 from pmsmtool.identification.verdicts import ENDED, not_measured
 from pmsmtool.identification.wiring import supply_power
@@ -377,6 +377,8 @@ class Measurement:
         self.say("noise: currents of the drive at rest")
         samples = standstill.NOISE_SAMPLES if self.accuracy is None else QUICK_NOISE_SAMPLES
         trace = standstill.record_zero_current(self.drive, samples)
+        if math.isfinite(self.limits.counts_per_turn):
+            trace = replace(trace, meta={**trace.meta, COUNTS: self.limits.counts_per_turn})
         self._keep_for_later("zero_current", trace)
         return estimate_noise(trace)
 

@@ -232,14 +232,20 @@ def _estimate_row(value: Mapping[str, Any]) -> list[Cell]:
     if _finite(value.get("i_d_apk")) or _finite(value.get("i_q_apk")):
         bias = (float(value[key]) if _finite(value.get(key)) else 0.0 for key in ("i_d_apk", "i_q_apk"))
         conditions.append("i_d {:.3g}, i_q {:.3g} A pk".format(*bias))
+    parts = (format_estimate(float(value["value"]), total, unit),
+             *(format_quantity(float(value[key]), unit, 2) for key in ("std", "systematic")))  # fmt: skip
+    if total == 0.0:
+        parts = f"{value['value']:.0f}", INTEGER, ""
     return [
         (value["name"], ""),
-        (format_estimate(float(value["value"]), total, unit), "number"),
-        (format_quantity(float(value["std"]), unit, 2), "number"),
-        (format_quantity(float(value["systematic"]), unit, 2), "number"),
+        *((part, "number") for part in parts),
         (", ".join(conditions), ""),
         (method, ""),
     ]
+
+
+INTEGER = "an integer"
+"""In place of the interval of pole pairs: they are that, or refused."""
 
 
 def total_interval(std: float, systematic: float, coverage_factor: float = 1.96) -> float:

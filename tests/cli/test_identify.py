@@ -217,6 +217,21 @@ def test_resistance_alone_is_possible_on_a_locked_shaft(tool: Tool) -> None:
 
 
 @pytest.mark.chain
+def test_pole_pairs_are_an_integer_by_the_counts_that_the_drive_states(tool: Tool) -> None:
+    """They had an interval of 0.0009, with the counts four times too many, too."""
+    code, out, err = tool("identify", "poles", "--sim", "interior-2k2?nv=:memory:", "--yes")
+    assert code == 0, err
+    rests = "by the drive's 131072 encoder counts per turn, like J, B, tau_c and speeds"
+    (row,) = (k for k, line in enumerate(out.splitlines()) if line.startswith("pole_pairs "))
+    told = [line.split() for line in out.splitlines()[row : row + 2]]
+    assert told[0][:4] == ["pole_pairs", "3", "an", "integer"] and rests in " ".join(told[0] + told[1])
+    (folder,) = Path("runs").iterdir()
+    assert tool("report", str(folder), "-o", "page.html")[0] == 0
+    page = Path("page.html").read_text("utf-8")
+    assert ">3</span>" in page and ">an integer</span>" in page and rests.replace("'", "&#39;") in page
+
+
+@pytest.mark.chain
 def test_the_map_of_a_locked_shaft_names_what_it_takes_from_the_drive_once(tool: Tool) -> None:
     """Its machine file had the offset 0 where the drive holds 0.35 rad: `tune` and `flash` would have written that."""
     bus = ("-i", "pmsmsim", "-c", profile("interior-2k2", rotor="locked", theta_M_start_rad=1.0), "--yes")

@@ -62,7 +62,7 @@ def wrong(rows: tuple[Row, ...]) -> list[str]:
     [
         ({"pole_pairs": 12}, ["pole_pairs"], "integer ratio 4: encoder counts per turn"),
         ({"pole_pairs": 6}, ["pole_pairs"], "poles instead of pole pairs"),
-        ({"pole_pairs": 4}, ["pole_pairs"], "another motor"),
+        ({"pole_pairs": 4}, ["pole_pairs"], "another motor, or encoder counts per turn (ratio 3/4)"),
         ({"R_s_ohm": 2.0}, ["R_s_ohm"], "line to line instead of phase"),
         ({"R_s_ohm": 0.5}, ["R_s_ohm"], "line to line instead of phase"),
         ({"psi_f_wb": 1.65}, ["psi_f_wb"], "Kt = 1.654 p psi"),

@@ -165,6 +165,12 @@ class _Held:
     def read(self, name: str) -> float:
         return self._changed.get(name, BY_NAME[name].default)
 
+    held_value = read
+
+    @property
+    def parameters(self) -> _Held:
+        return self
+
 
 @pytest.mark.parametrize(("held", "known"), [(-12.0, None), (-15.0, None), (-10.0, -10.0)])
 def test_a_drive_whose_i_d_may_reach_the_largest_current_states_no_demagnetisation_limit(
@@ -172,3 +178,9 @@ def test_a_drive_whose_i_d_may_reach_the_largest_current_states_no_demagnetisati
 ) -> None:
     drive = _Held(motor__I_max_apk=12.0, motor__I_nom_apk=6.0, field_weakening__i_d_min_a=held)
     assert nameplate_of(drive, "held").limits.i_d_min_apk == known  # type: ignore[arg-type]
+
+
+def test_the_nameplate_has_the_encoder_that_the_drive_holds() -> None:
+    drive = _Held(encoder__offset_rad=0.35, encoder__reversed=1.0)
+    encoder = nameplate_of(drive, "held").encoder  # type: ignore[arg-type]
+    assert (encoder.offset_rad, encoder.direction) == (0.35, -1)
