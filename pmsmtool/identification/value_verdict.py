@@ -128,15 +128,13 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
             f"the gains of the current sensors of a, b and c are {gains} off their mean: corrected in the values, not "
             "in the drive, whose torque ripples twice per electrical turn"
         )
-    if evaluation.encoder is not None:
-        lines += [
-            f"the encoder is off by {math.degrees(error):.2g} deg (mechanical) {often} per turn: mounted off centre? "
-            "J, B and tau_c of torque pulses are without it"
-            for often, error in zip(("once", "twice"), evaluation.encoder.per_turn_rad, strict=False)
-            if error > 0.0
-        ]
-        if evaluation.encoder.offset.method == RESTS:
-            lines.append(NO_SLOW_TURN)
+    lines += [
+        f"the encoder is off by {math.degrees(error_rad):.2g} deg (mechanical) {OFTEN[order]} per turn: mounted off "
+        "centre? J, B and tau_c of torque pulses are without it"
+        for order, error_rad in sorted(_encoder_errors(evaluation).items())
+    ]
+    if evaluation.encoder is not None and evaluation.encoder.offset.method == RESTS:
+        lines.append(NO_SLOW_TURN)
     if evaluation.mechanics is not None and evaluation.mechanics.harmonics.line_rad:
         once = evaluation.mechanics.harmonics.line_rad[0]
         error_rad = max(h.amplitude for h in evaluation.mechanics.harmonics.line_rad)
@@ -173,6 +171,20 @@ IF_APART = {
     "`identify map` measures it, `commission --flux-map` designs with it",
 }
 """What to do where a second method disagrees, by the quantity."""
+
+
+OFTEN = dict(zip(ENCODER_ORDERS, ("once", "twice"), strict=True))
+
+
+def _encoder_errors(evaluation: Evaluation) -> dict[int, float]:
+    """Return the encoder's error (rad) by its order per turn: of a coasting where there is one, else of slow turns."""
+    errors_rad: dict[int, float] = {}
+    if evaluation.encoder is not None:
+        errors_rad = {k: v for k, v in zip(ENCODER_ORDERS, evaluation.encoder.per_turn_rad, strict=False) if v > 0.0}
+    errors_rad |= evaluation.encoder_errors
+    if evaluation.mechanics is not None:
+        errors_rad |= {h.order: h.amplitude for h in evaluation.mechanics.harmonics.encoder_rad}
+    return errors_rad
 
 
 def _bend_note(inductance: InductanceResult, *, tried: bool) -> list[str]:
@@ -225,21 +237,15 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions[LOAD_RATIO] = evaluation.load_ratio
     if "mechanics" in request.measured and "J_kgm2" not in evaluation.estimates():
         conditions[INERTIA] = REFUSED
-    errors_rad: dict[int, float] = {}
-    if evaluation.encoder is not None:
-        errors_rad = {k: v for k, v in zip(ENCODER_ORDERS, evaluation.encoder.per_turn_rad, strict=False) if v > 0.0}
-    errors_rad |= evaluation.encoder_errors
     if evaluation.mechanics is not None:
         if evaluation.mechanics.drag is not None:
             conditions["drag_nms2"] = evaluation.mechanics.drag.value
         if evaluation.mechanics.unexplained and not evaluation.mechanics.J.fallback:
             conditions[TORQUE_NOISE] = evaluation.mechanics.ripple
-        errors_rad |= {h.order: h.amplitude for h in evaluation.mechanics.harmonics.encoder_rad}
         for name, h in zip(("line", "line_twice"), evaluation.mechanics.harmonics.line_rad, strict=False):
             conditions[f"encoder_{name}_rad"] = h.amplitude
             conditions.setdefault("encoder_lines", h.order)
-    often = dict(zip(ENCODER_ORDERS, ("once", "twice"), strict=True))
-    conditions |= {f"encoder_{often[order]}_rad": error_rad for order, error_rad in errors_rad.items()}
+    conditions |= {f"encoder_{OFTEN[order]}_rad": error for order, error in _encoder_errors(evaluation).items()}
     if evaluation.cogging is not None and evaluation.cogging.harmonics.acceleration_rad_s2:
         largest = max(evaluation.cogging.harmonics.acceleration_rad_s2, key=lambda h: h.amplitude)
         conditions |= {"cogging_nm": evaluation.cogging.J.value * largest.amplitude, "cogging_periods": largest.order}

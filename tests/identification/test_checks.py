@@ -9,11 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pmsmtool.estimators.angle_harmonics import AngleHarmonics, Harmonic
 from pmsmtool.estimators.current_sensors import Noise
+from pmsmtool.estimators.encoder import EncoderResult
 from pmsmtool.estimators.flux.linkage import FluxResult
+from pmsmtool.estimators.shaft.mechanics import MechanicsResult
 from pmsmtool.identification.evaluate import Evaluation
 from pmsmtool.identification.request import IdentifyRequest
-from pmsmtool.identification.value_verdict import IF_APART, summary_of, warnings_of
+from pmsmtool.identification.value_verdict import IF_APART, conditions_of, summary_of, warnings_of
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.refusals import refuse
 
@@ -58,3 +61,20 @@ def test_a_disagreement_ends_with_what_to_do() -> None:
     (line,) = [line for line in warnings_of(apart, IdentifyRequest(("psi",))) if "DISAGREES" in line]
     assert line.endswith(IF_APART["psi_f_wb"]) and "--speed-max" in line
     assert {"psi_f_wb", "L_q_h"} == set(IF_APART) and "`commission --flux-map`" in IF_APART["L_q_h"]
+
+
+def test_the_encoder_errors_that_are_told_are_those_of_the_machine_file() -> None:
+    """0.44 and 0.42 deg were told of a slow turn, and 0.500 and 0.250 deg kept of the coasting; elsewhere none told."""
+    turned = tuple(Harmonic(k, math.radians(off), 0.0, 1e-6) for k, off in ((1, 0.44), (2, 0.42)))
+    coasted = tuple(Harmonic(k, math.radians(off), 0.0, 1e-6) for k, off in ((1, 0.5), (2, 0.25)))
+    one = Estimate(1.0, 0.01, 0.0, "1")
+    encoder = EncoderResult(one, 1, one, 0.0, turned)
+    mechanics = MechanicsResult(one, one, one, (0.0, 0.0, 0.0), 0.0, 1.0, False, AngleHarmonics(coasted))
+    asked = IdentifyRequest(("mechanics",))
+    for found, told in ((Evaluation(Noise(0.01, 0.0, 0.0), encoder=encoder), ("0.44", "0.42")),
+                        (Evaluation(Noise(0.01, 0.0, 0.0), encoder=encoder, mechanics=mechanics), ("0.5", "0.25")),
+                        (Evaluation(Noise(0.01, 0.0, 0.0), mechanics=mechanics), ("0.5", "0.25"))):  # fmt: skip
+        lines = [line for line in warnings_of(found, asked) if "the encoder is off by" in line]
+        for line, deg, often in zip(lines, told, ("once", "twice"), strict=True):
+            assert f"off by {deg} deg (mechanical) {often} per turn" in line
+            assert math.degrees(conditions_of(found, asked)[f"encoder_{often}_rad"]) == pytest.approx(float(deg))
