@@ -31,6 +31,7 @@ from pmsmtool.identification.by_injection import evaluation_of
 from pmsmtool.identification.compared_runs import same_drive
 from pmsmtool.identification.evaluate import Evaluation, evaluate, shots_of
 from pmsmtool.identification.fingerprint import STAGE as FINGERPRINT
+from pmsmtool.identification.flux_map import MAP_FILE
 from pmsmtool.identification.request import NAMEPLATE, REQUEST, parse_request, stored_traces
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.run_account import account_lines
@@ -49,9 +50,10 @@ NOT_CHECKED = (
     "measure them.",
     "The hardware stop (safe torque off, mains, emergency stop): the stops of this run went over the bus.",
     "Continuous torque and temperatures under load.",
-    "Saturation beyond the bias points that are named, cogging and slot harmonics, iron losses.",
 )
-"""What a reader of a green report must not assume."""
+"""What a reader of a green report must not assume, besides what was not measured of the machine."""
+EFFECTS = {"cogging_nm": "cogging", "psi_5_wb": "harmonics of the back-EMF"}
+"""Values that show an effect, and what it is called."""
 SERVED = ("socketcand", "virtual", "udp_multicast")
 """Interfaces of python-can behind which another program may stand instead of a drive."""
 ANY_DRIVE = (
@@ -90,6 +92,7 @@ def report_page(path: str | Path) -> str:
     if not any(record.passed(stage) for stage in ("flash", "verify", "prove")):
         not_checked = (NOTHING_COMPARED, *NOT_CHECKED[1:])
     identified = record.stage("identify")
+    not_checked = (*not_checked, _unmeasured(identified))
     if identified is not None and identified.comparison and not any(row.get("stated") for row in identified.comparison):
         not_checked = (*not_checked, NO_DATA_SHEET)
     if not is_simulated(asdict(record)) and record.bus.get("interface") in SERVED:
@@ -98,6 +101,16 @@ def report_page(path: str | Path) -> str:
     return render(asdict(record), figures=drawn, changes=_changes(record), not_checked=not_checked,
                   complete=_complete(record), ended=account_lines(record.account), recomputed=again,
                   moves=_move_table(moves))  # fmt: skip
+
+
+def _unmeasured(identified: Stage | None) -> str:
+    """Return which effects of a machine nothing of the run has measured."""
+    values, files = ([], {}) if identified is None else (identified.values, identified.files)
+    known = {value["name"] for value in values if value.get("accepted", True)}
+    mapped = any(Path(name).name == MAP_FILE for name in files)
+    saturation = "currents of the flux map" if mapped else "bias points that are named"
+    lacking = [effect for name, effect in EFFECTS.items() if name not in known]
+    return ", ".join([f"Saturation beyond the {saturation}", *lacking, "slot harmonics of L, iron losses."])
 
 
 def verdict(path: Path) -> Verdict:

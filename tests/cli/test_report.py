@@ -390,3 +390,33 @@ def test_axe_core_finds_nothing_serious(made: Path, tmp_path: Path, scheme: str)
     )  # fmt: skip
     passed, _, wrong = found.partition(" ")
     assert int(passed) > 15 and not re.search("serious|critical", wrong), found
+
+
+@pytest.mark.parametrize(
+    ("measured", "rejected", "files", "unchecked"),
+    [
+        (
+            (),
+            (),
+            (),
+            "bias points that are named, cogging, harmonics of the back-EMF, slot harmonics of L, iron losses.",
+        ),
+        (("cogging_nm",), (), (), "named, harmonics of the back-EMF, slot harmonics of L, iron losses."),
+        (("cogging_nm", "psi_5_wb"), (), ("flux_map.npz",), "flux map, slot harmonics of L, iron losses."),
+        (("cogging_nm", "psi_5_wb"), ("cogging_nm",), (), "named, cogging, slot harmonics of L, iron losses."),
+    ],
+)
+def test_the_page_says_unchecked_of_no_effect_that_was_measured(
+    measured: tuple[str, ...], rejected: tuple[str, ...], files: tuple[str, ...], unchecked: str, tmp_path: Path
+) -> None:
+    """It said so of cogging in every report, also in that of `identify cogging`."""
+    record = new_record(["identify"], drive={}, bus={}, versions={}, operator="nobody")
+    run = RunDirectory.create(tmp_path, 7, record)
+    values = [
+        {**value_facts(name, Estimate(0.1, 0.01, 0.0, "1")), "accepted": name not in rejected} for name in measured
+    ]
+    for name in files:
+        (run.path / name).write_bytes(b"")
+    run.add(Stage("identify", "pass", 1.0, values=values, files=dict.fromkeys(files, "")))
+    page = report_page.report_page(run.path)
+    assert f"{unchecked}</li>" in page and page.count("slot harmonics") == 1
