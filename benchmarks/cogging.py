@@ -68,11 +68,11 @@ def truths_of(drive: MachineFile) -> dict[str, tuple[float, float, float]]:
     rated = 1.5 * p * psi * float(drive.machine.I_nom_apk or 1.0)
     order = round(values.number("cogging_periods"))
     phase = order * values.number("encoder_offset_rad") / p - 0.5 * math.pi
-    # the harmonics of the simulated magnets do not follow their temperature
     found = {f"cogging_{order}": (values.number("cogging_nm"), phase, rated)}
     warm = 1.0 + values.number("alpha_psi_per_k") * (values.number("T_magnet_c") - drive.machine.T_ref_c)
-    found["psi_5"] = (values.number("psi_6_wb"), 0.0, psi * warm / 5.0)
-    found["psi_7"] = (values.number("psi_7_wb"), 0.0, psi * warm / 7.0)
+    # harmonics follow the magnets' temperature, as in the plant (sim/plant_point.h)
+    found["psi_5"] = (values.number("psi_6_wb") * warm, 0.0, psi * warm / 5.0)
+    found["psi_7"] = (values.number("psi_7_wb") * warm, 0.0, psi * warm / 7.0)
     return found
 
 
