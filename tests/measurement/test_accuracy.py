@@ -226,7 +226,7 @@ def test_few_samples_still_hold_the_periods_of_a_slow_square_wave(tmp_path: Path
 
 def test_speeds_that_are_not_enough_are_followed_by_all(monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[Any] = []
-    monkeypatch.setattr(SpeedStage, "_pushes", lambda self, resistance, pole_pairs: (0.1, 1e-3))
+    monkeypatch.setattr(SpeedStage, "_pushes", lambda *given: (0.1, 1e-3))
     monkeypatch.setattr(SpeedStage, "_speeds", lambda self, *known: ran.append(self.effort))
     drive: Any = SimpleNamespace(period_s=1e-4, disable=lambda: None, enable=lambda: None, write=lambda values: None)
     encoder: Any = SimpleNamespace(pole_pairs=SimpleNamespace(value=3.0))
