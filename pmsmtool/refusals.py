@@ -146,7 +146,7 @@ _ROWS: tuple[tuple[str, str, str, str], ...] = (
     ),
     (
         "E_NOT_SET_UP",
-        "the drive holds the factory's encoder offset or psi_f, which a held rotor cannot show",
+        "the drive's encoder offset, pole pairs or psi_f are the factory's or another motor's; a held rotor needs them",
         "a drive that was not set up for this motor",
         "free the shaft and `commission`, which measures and stores them; then hold the rotor",
     ),

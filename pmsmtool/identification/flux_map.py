@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pmsmtool.estimators.estimate import SensorTolerance
 from pmsmtool.estimators.flux.map_fit import MagnetFlux
 from pmsmtool.estimators.flux.map_result import STAGE, FluxMapResult, estimate_flux_map
@@ -31,6 +33,9 @@ MAP_INTERVALS = "flux_map_intervals.npz"
 SET_UP_BY = ("encoder.offset_rad", "motor.psi_f_wb")
 """Parameters without which a held rotor's map has neither angle nor constant; one with the factory's value was set by
 nobody. Pole pairs and direction tell nothing: many a motor has the factory's."""
+SALIENT, TURNED_MOST_DEG = 0.2, 10.0
+"""Saliency from which on the axes of a held rotor's map count: at it 2.2 % by slots turn them by 3 deg. And how far
+they may stand from the drive's (deg electrical); with the machine's own set 0.02 deg and less was measured."""
 SAME_SHARE = 1e-6
 """Within this of the factory's value (binary32) it is that."""
 CORRECTION_STD = 0.2
@@ -63,7 +68,8 @@ def require_set_up(pole_pairs: float, held: Mapping[str, float]) -> None:
         f"({pole_pairs:.0f} pole pairs)",
         stage=STAGE,
         hint="free the shaft and `commission`, which measures and stores them; or `param set motor.pole_pairs=P "
-        "encoder.offset_rad=RAD motor.psi_f_wb=WB --store` (an offset of 0 as 6.2831853). R and inverter need neither",
+        "encoder.offset_rad=RAD motor.psi_f_wb=WB --store` (a true 0 as 6.2831853, a true 0.41 as 0.41001). "
+        "R and inverter need neither",
     )
 
 
@@ -109,6 +115,15 @@ def flux_map_of(
     if not held:
         return found
     turned = math.degrees(found.fit.frame.offset_rad - drive_offset)
+    L_dd, _, L_qq = found.fit.inductance(np.zeros(1), np.zeros(1))[:, 0]
+    if abs(L_dd - L_qq) > SALIENT * min(L_dd, L_qq) and abs(turned) > TURNED_MOST_DEG:
+        raise refuse(
+            "E_NOT_SET_UP",
+            f"the map's axes stand {turned:+.2g} deg (electrical) at the nearest from those by the drive's "
+            f"{abs(pole_pairs)} pole pairs and encoder offset of {drive_offset:.4g} rad, limit {TURNED_MOST_DEG:g} deg",
+            stage=STAGE,
+            likely="pole pairs or an encoder offset of another motor, or an encoder that was moved on its shaft",
+        )
     told = (
         f"flux map: psi_f {magnet.psi_wb:.4g} Wb, {abs(pole_pairs)} pole pairs and encoder offset {drive_offset:.4g} "
         "rad are those that the drive holds, not measured: a held rotor shows increments of flux, and its axes to a "

@@ -246,6 +246,10 @@ def test_the_map_of_a_locked_shaft_names_what_it_takes_from_the_drive_once(tool:
     assert machine.encoder.offset_rad == pytest.approx(0.35, rel=1e-6) and machine.machine.psi_f_wb == 0.545
     told = "psi_f 0.545 Wb, 3 pole pairs and encoder offset 0.35 rad are those that the drive holds, not measured"
     assert err.count("those that the drive holds") == 1 and told in err
+    code, _, other = tool("param", "set", "encoder.offset_rad=0.75", "--store", *bus)
+    assert code == 0, other
+    code, _, other = tool("identify", "map", "--shaft", "locked", *bus)
+    assert code == 6 and "the map's axes stand -23 deg (electrical) at the nearest" in other, other
     assert tool("report", data["run"], "-o", "page.html")[0] == 0 and told in Path("page.html").read_text("utf-8")
 
 
