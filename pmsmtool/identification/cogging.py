@@ -42,7 +42,8 @@ if TYPE_CHECKING:
 
 COGGING_CSV = "cogging.csv"
 ROWS = 1024
-"""Rows of the table over one turn."""
+"""Rows of the table over one turn, or over what was seen of it."""
+PARTIAL = "partial"
 ORDERS_PER_POLE_PAIR = 18
 """Highest order that none being found is stated for: the least common multiple of slots and poles is 6 to 18 times the
 pole pairs of usual windings (9 slots on 8 poles: 72)."""
@@ -68,10 +69,33 @@ rated torque beside 0.09 %, seen once)."""
 
 
 @dataclass(frozen=True, slots=True)
+class Part:
+    """Part of a turn that was seen: from an angle (rad, as the drive shows it) over a way (rad)."""
+
+    start_rad: float
+    way_rad: float
+    lowest_order: int
+    apart: int
+    """Orders that differ by less are not separated."""
+    ambiguous: tuple[int, ...] = ()
+    """Orders that may as well be a neighbour: they get no phase."""
+    left_nm: float = 0.0
+    """Root mean square of the torque that the orders leave (N m)."""
+
+    def __str__(self) -> str:
+        ambiguous = f"; {', '.join(map(str, self.ambiguous))} may be a neighbour" if self.ambiguous else ""
+        return (
+            f"partial: over {self.way_rad / math.tau:.2g} of a turn; orders below {self.lowest_order} are not "
+            f"identified, orders that differ by less than {self.apart} are not separated{ambiguous}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Cogging:
     """Accelerations over the angle, the inertia (kg m2), and what is said where there are none.
 
-    ``floor_nm`` is the amplitude from which on every order up to ``highest_order`` is found.
+    ``floor_nm`` is the amplitude from which on every order up to ``highest_order`` is found, ``part`` what was seen of
+    a turn where that is less than all of it.
     """
 
     harmonics: AngleHarmonics
@@ -79,6 +103,7 @@ class Cogging:
     highest_order: int
     floor_nm: float
     how: str
+    part: Part | None = None
 
     def estimates(self) -> dict[str, Estimate]:
         """Return the largest torque, and amplitude (N m) and phase (rad) of every order per turn, by their names.
@@ -86,31 +111,38 @@ class Cogging:
         The torque along the phase order is amplitude cos(order theta - phase), theta the encoder's angle along it.
         Where none was found the largest torque is 0, with the floor as its 95 % interval.
         """
-        J, harmonics = self.J, self.harmonics
+        J, harmonics, part = self.J, self.harmonics, self.part
+        how, fallback = (self.how, "") if part is None else (f"{self.how}; {part}", PARTIAL)
+        ambiguous = () if part is None else part.ambiguous
         if not harmonics.acceleration_rad_s2:
-            method = f"none found up to order {self.highest_order} per turn, {self.how}; the interval is what would be"
-            return {"cogging_nm": Estimate(0.0, self.floor_nm / COVERAGE_FACTOR, 0.0, "N m", method=method)}
+            method = f"none found up to order {self.highest_order} per turn, {how}; the interval is what would be"
+            std = self.floor_nm / COVERAGE_FACTOR
+            return {"cogging_nm": Estimate(0.0, std, 0.0, "N m", method=method, fallback=fallback)}
         found: dict[str, Estimate] = {}
-        largest = float(np.max(np.abs(harmonics.torque_nm(turn(), J.value))))
+        largest = float(np.max(np.abs(harmonics.torque_nm(self.angles, J.value))))
         std = math.hypot(self.table_std_nm, J.std / J.value * largest)
         scale = J.systematic / J.value
-        found["cogging_nm"] = Estimate(largest, std, scale * largest, "N m", method=f"largest over a turn, {self.how}")
+        method = f"largest over {'a turn' if part is None else 'the way'}, {how}"
+        found["cogging_nm"] = Estimate(largest, std, scale * largest, "N m", method=method)
         for h in harmonics.acceleration_rad_s2:
-            method = f"order {h.order} per turn, {self.how}"
+            method = f"order {h.order} per turn, {how}"
             amplitude, std = J.value * h.amplitude, math.hypot(J.value * h.std, J.std * h.amplitude)
             found[f"cogging_{h.order}_nm"] = Estimate(amplitude, std, scale * amplitude, "N m", method=method)
-            found[f"cogging_{h.order}_rad"] = Estimate(h.phase_rad, h.std / h.amplitude, 0.0, "rad", method=method)
-        return found
+            if h.order not in ambiguous:
+                found[f"cogging_{h.order}_rad"] = Estimate(h.phase_rad, h.std / h.amplitude, 0.0, "rad", method=method)
+        return {name: replace(estimate, fallback=fallback) for name, estimate in found.items()}
+
+    @property
+    def angles(self) -> Array:
+        """Angles of the table (rad): of a turn, or of what was seen of it; shape (ROWS,)."""
+        if self.part is None:
+            return np.linspace(0.0, 2.0 * math.pi, ROWS, endpoint=False)
+        return np.linspace(self.part.start_rad, self.part.start_rad + self.part.way_rad, ROWS)
 
     @property
     def table_std_nm(self) -> float:
         """Standard deviation of the torque at an angle, beside that of the inertia (N m)."""
         return self.J.value * math.sqrt(sum(h.std**2 for h in self.harmonics.acceleration_rad_s2))
-
-
-def turn() -> Array:
-    """Return the angles of the table (rad), shape (ROWS,)."""
-    return np.linspace(0.0, 2.0 * math.pi, ROWS, endpoint=False)
 
 
 def cogging_of(traces: Mapping[str, Trace], result: Evaluation) -> Cogging | None:
@@ -189,6 +221,7 @@ def torque_orders(t_s: Array, theta: Array, torque_nm: Array, J_kgm2: float, hig
             f"the shaft turned {way[-1] / (2.0 * math.pi):.2g} times at low speed, one whole turn is needed",
             stage="cogging",
             likely="cogging or friction that the speed controller does not overcome at 30 rpm, or a limited travel",
+            hint="`pmsmtool move --cogging MACHINE` sees a part of it within an angle, by the position loop",
         )
     angle = np.arange(turns * GRID) * (2.0 * math.pi / GRID)
     step = np.diff(way)
@@ -249,7 +282,7 @@ def save_cogging(run: RunDirectory, cogging: Cogging | None, direction: int) -> 
     """
     if cogging is None or not cogging.harmonics.acceleration_rad_s2:
         return {}
-    theta = turn()
+    theta = cogging.angles
     torque = cogging.harmonics.torque_nm(direction * theta, cogging.J.value)
     half = COVERAGE_FACTOR * cogging.table_std_nm
     rows = [f"{angle:.9g},{value:.6g},{half:.3g}" for angle, value in zip(theta, torque, strict=True)]
