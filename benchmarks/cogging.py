@@ -8,7 +8,8 @@ poles, a 5th of 0.5 to 5 % and a 7th of 0.3 to 3 % of the back-EMF, both drawn e
 `identify --yes` runs over frames. A target is met within 10 % or 0.1 % of rated torque (of the fundamental), and 5
 degrees. Marks behind a row: X and P where amplitude and phase miss it, ! where their interval does not cover. With
 ``--real`` the drives are those of ``benchmarks/real_population.py``, with their other effects. ``--replay`` evaluates
-the kept runs anew; ``--table`` only prints.
+the kept runs anew; ``--table`` only prints. With ``--way 180`` a drive with the objects of ``--face`` moves by that
+angle and back instead, `move --cogging` with the machine's own file.
 """
 
 from __future__ import annotations
@@ -76,10 +77,15 @@ def truths_of(drive: MachineFile) -> dict[str, tuple[float, float, float]]:
     return found
 
 
-def judged(drive: MachineFile, estimates: dict[str, Estimate]) -> dict[str, Any]:
-    """Return of every ripple: truth and error of rated (%), half width (%), error and half width of the phase (deg)."""
+def judged(drive: MachineFile, estimates: dict[str, Estimate], moved: bool = False) -> dict[str, Any]:
+    """Return of every ripple: truth and error of rated (%), half width (%), error and half width of the phase (deg).
+
+    ``moved``: angle and torque are those that the drive shows, which an encoder may count against the phase order.
+    """
     rows: dict[str, Any] = {}
+    against = moved and drive.simulation.get("encoder_reversed", False) != drive.simulation.get("leads_swapped", False)
     for name, (amplitude, phase, rated) in truths_of(drive).items():
+        phase = -phase - math.pi if against else phase
         unit = "nm" if name.startswith("cogging") else "wb"
         found, angle = estimates.get(f"{name}_{unit}"), estimates.get(f"{name}_rad")
         row = {"truth": 100.0 * amplitude / rated}
@@ -136,6 +142,26 @@ def identify_one(name: str, keep: Path, again: bool, cogging: float | None, emf:
     return {**result, "seconds": time.process_time() - start}
 
 
+def move_one(name: str, keep: Path, cogging: float | None, emf: float, way_deg: float, face: str) -> dict[str, Any]:
+    """See a part of a turn by slow moves of a drive of another maker."""
+    drive = drive_of(name, cogging, emf)
+    kept = keep.resolve() / f"{name}_{'drawn' if cogging is None else f'{cogging:g}'}_{way_deg:g}"
+    result: dict[str, Any] = {"name": name, "cogging": cogging, "refused": {}, "rows": {}, "told": ""}
+    with prepared():
+        Path("drive.toml").write_text(dump_machine_file(drive, embed_flux_map=True), encoding="utf-8")
+        known = replace(drive, simulation={})
+        Path("known.toml").write_text(dump_machine_file(known, embed_flux_map=True), encoding="utf-8")
+        simulated = ("--map", face, "--sim", f"{Path('drive.toml').resolve()}?drive={face}&nv={Path('nv').resolve()}")
+        code, told = commanded("move", "--by", f"{way_deg:g}deg", "--cogging", "known.toml", *simulated, "--yes")
+        result |= {"code": code, "told": told.strip().splitlines()[-4:] if code else ""}
+        for folder in Path("runs").glob("*/"):
+            if (folder / MACHINE).is_file():
+                result["rows"] = judged(drive, dict(load_machine_file(folder / MACHINE).estimates), moved=True)
+            shutil.rmtree(kept, ignore_errors=True)
+            shutil.copytree(folder, kept)
+    return result
+
+
 def line_of(result: dict[str, Any]) -> str:
     """Return one line of the table."""
     cells = []
@@ -186,6 +212,8 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=Path("cogging.jsonl"))
     parser.add_argument("--keep", type=Path, default=Path("cogging_runs"), help="folder that keeps the runs")
     parser.add_argument("--real", action="store_true", help="drives with other effects of real machines")
+    parser.add_argument("--way", type=float, help="degrees of a move there and back, instead of an identification")
+    parser.add_argument("--face", default="ingenia", help="whose objects the moved drive has")
     parser.add_argument("--replay", action="store_true")
     parser.add_argument("--table", action="store_true")
     asked = parser.parse_args()
@@ -201,7 +229,10 @@ def main() -> None:
     results = []
     with asked.results.open("a", encoding="utf-8") as file:
         for name in names:
-            result = identify_one(name, asked.keep, asked.replay, asked.cogging, asked.emf)
+            if asked.way:
+                result = move_one(name, asked.keep, asked.cogging, asked.emf, asked.way, asked.face)
+            else:
+                result = identify_one(name, asked.keep, asked.replay, asked.cogging, asked.emf)
             file.write(json.dumps(result) + "\n")
             file.flush()
             print(line_of(result), flush=True)

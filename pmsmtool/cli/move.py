@@ -45,8 +45,12 @@ if TYPE_CHECKING:
     from pmsmtool.machine.machine_file import MachineFile
     from pmsmtool.machine.parameters import Estimate
 
-IDENTIFY_TIMES = 4
-"""Moves there and back for inertia and friction: sixteen halves."""
+IDENTIFY_TIMES, COGGING_TIMES = 4, 2
+"""Moves there and back for inertia and friction, sixteen halves; and for cogging."""
+COGGING_RAD_S, COGGING_RAMP = math.pi, 0.05
+"""Speed of these, 30 rpm, where none is given, and both of their ramps, of the way."""
+COGGING_SPEEDS, COGGING_TRAVEL = 4.0, 1.1
+"""Limits of them over speed and way: cogging pulls the shaft on from one rest to the next."""
 
 
 @click.command(
@@ -68,8 +72,11 @@ IDENTIFY_TIMES = 4
               help="Acceleration of the move, e.g. 3000rpm/s.  [default: as the drive holds it]")  # fmt: skip
 @click.option("--identify", "machine", metavar="MACHINE", help="Find inertia and friction of this machine (a machine "
               "file) from the moves.")  # fmt: skip
-@new_file("path", help="Machine file to write with what --identify found.  [default: machine.toml of the run]")
-@click.option("--times", type=click.IntRange(1, 20), help="Moves there and back.  [default: 1, with --identify 4]")
+@click.option("--cogging", metavar="MACHINE", help="Find the cogging of this machine over the way, by slow moves: a "
+              "part of a turn.")  # fmt: skip
+@new_file("path", help="Machine file to write with what was found.  [default: machine.toml of the run]")
+@click.option("--times", type=click.IntRange(1, 20), help="Moves there and back.  [default: 1; 2 with --cogging, 4 "
+              "with --identify]")  # fmt: skip
 @click.option("--settle", "settle_s", type=DURATION, default="0.5s", help="How long to look on after the demand ended.")
 @runs_option
 @map_option
@@ -78,8 +85,8 @@ IDENTIFY_TIMES = 4
 @output_options
 def move_command(
     bus: BusOptions, motion: MotionOptions, out: Output, way_rad: float, design: Path | None, flash: bool,
-    speed_rad_s: float | None, acceleration: float | None, machine: str | None, path: Path | None, times: int | None,
-    settle_s: float, runs: Path, map_file: Path | None,
+    speed_rad_s: float | None, acceleration: float | None, machine: str | None, cogging: str | None, path: Path | None,
+    times: int | None, settle_s: float, runs: Path, map_file: Path | None,
 ) -> None:  # fmt: skip
     """Move the shaft by an angle and back with the position loop that the drive holds, and record how it followed.
 
@@ -90,10 +97,13 @@ def move_command(
 
     With --identify: inertia and Coulomb friction of MACHINE from the current of the moves, for a drive without a torque
     mode. They rest on the flux linkage and the pole pairs of MACHINE. Exit code 6 when the moves do not identify them.
+
+    With --cogging: torque over the angle of a shaft that may not turn round, by order, and a table of the way (30 rpm
+    unless --speed says otherwise). It rests on flux linkage, pole pairs and inertia of MACHINE.
     """
     from pmsmtool.cli.flash_session import flashed
     from pmsmtool.cli.flash_session import told as outcome_line
-    from pmsmtool.commissioning.move import plan_move
+    from pmsmtool.commissioning.move import inertia_of, moved_cogging, moved_machine, plan_move
     from pmsmtool.commissioning.parameter_source import load_parameters
     from pmsmtool.design.design_file import load_design
     from pmsmtool.drive.envelope import Envelope
@@ -103,19 +113,30 @@ def move_command(
 
     if not way_rad:
         raise ConfigError("--by 0 moves nothing", hint="give a way, e.g. --by 90deg")
-    if flash and (design is None or machine is not None):
-        raise click.UsageError("--flash writes the values of --design, and goes without --identify")
-    source = None if machine is None else load_machine_file(machine)
+    if flash and (design is None or machine or cogging):
+        raise click.UsageError("--flash writes the values of --design, and goes without --identify and --cogging")
+    if machine and cogging:
+        raise click.UsageError("--identify takes fast moves and --cogging slow ones: one after the other")
+    name = machine or cogging
+    source = None if name is None else load_machine_file(name)
     drive_map = map_of_drive(bus, map_file)
+    speed_max_rad_s, travel_rad = motion.speed_max_rad_s or math.inf, math.inf
+    if cogging and source is not None:
+        inertia_of(source)  # before anything moves
+        speed_rad_s = speed_rad_s or COGGING_RAD_S
+        acceleration = acceleration or speed_rad_s**2 / (COGGING_RAMP * abs(way_rad))
+        speed_max_rad_s = min(speed_max_rad_s, COGGING_SPEEDS * speed_rad_s)
+        travel_rad, times = COGGING_TRAVEL * abs(way_rad), times or COGGING_TIMES
     allowed = Envelope(
-        i_max_apk=motion.i_max_apk or math.inf, speed_max_rad_s=motion.speed_max_rad_s or math.inf,
+        i_max_apk=motion.i_max_apk or math.inf, speed_max_rad_s=speed_max_rad_s, travel_rad=travel_rad,
         shaft=motion.shaft or "free", load=motion.load, brake=motion.brake,
     )  # fmt: skip
     plan = partial(
         plan_move, allowed=allowed, way_rad=way_rad, times=times or (1 if source is None else IDENTIFY_TIMES),
         design=None if design is None else load_design(design), speed_rad_s=speed_rad_s, acceleration=acceleration,
     )  # fmt: skip
-    moves = _Moves(bus, motion, out, runs, drive_map, plan, settle_s, {}, [])
+    find = moved_cogging if cogging else moved_machine
+    moves = _Moves(bus, motion, out, runs, drive_map, plan, find, settle_s, {}, [])
     if design is None or not flash:
         data = moves.make(source, path)
         out.result("move", data, lambda: [*_lines(data), *_told(data["identified"])])
@@ -150,6 +171,7 @@ class _Moves:
     runs: Path
     drive_map: DriveMap
     plan: Callable[..., PlannedMove]
+    find: Callable[..., tuple[MachineFile, dict[str, Estimate]]]
     settle_s: float
     agreed: dict[object, Consent]
     planned: list[PlannedMove]
@@ -160,10 +182,10 @@ class _Moves:
     ) -> dict[str, Any]:
         """Ask unless it is agreed to, move there and back, keep the run, and return what is told of it.
 
-        ``source``: machine whose inertia and friction are found, written to ``path``; ``then``: what follows the move.
+        ``source``: machine of which something is found, written to ``path``; ``then``: what follows the move.
         """
         from pmsmtool.cli.consent import ask_motion, keep
-        from pmsmtool.commissioning.move import make_move, moved_machine
+        from pmsmtool.commissioning.move import make_move
         from pmsmtool.drive.position_drive import PositionDrive
         from pmsmtool.flash.map_gate import check_motion
         from pmsmtool.machine.machine_file import dump_machine_file
@@ -192,8 +214,11 @@ class _Moves:
             out.warn(line)
         told: dict[str, Estimate] = {}
         if source is not None:
-            completed, told = moved_machine(source, trace, drive, run)
-            if "tau_c_nm" not in told:
+            completed, told = self.find(source, trace, drive, run)
+            stage = run.read().stage("cogging")
+            for line in () if stage is None else stage.fallbacks:
+                out.warn(line)
+            if stage is None and "tau_c_nm" not in told:
                 out.warn("tau_c_nm not identified: these moves show no friction above zero; longer ones (--by) may")
             if path is not None:
                 write_file(path, dump_machine_file(completed))

@@ -355,14 +355,14 @@ def _allowed(
     name: str, value: float, file: MachineFile, found: Mapping[str, _Measured], *, T_known: bool
 ) -> tuple[float, float, str]:
     """Return the range a stated value allows, and how that is called."""
-    share, text = _share(name, file)
+    share, text = stated_share(name, file)
     # a catalogue does not say whether its share is of what it states or of what is there
     low, high = 1.0 - share, 1.0 + share if name in file.std else 1.0 / (1.0 - share)
     machine = file.machine
     span = f"{UNKNOWN_T_RANGE_C[0]:g} to {UNKNOWN_T_RANGE_C[1]:g} degC"
     if name == RATIO:
-        over, _ = _share("J_kgm2", file)
-        under, _ = _share("psi_f_wb", file)
+        over, _ = stated_share("J_kgm2", file)
+        under, _ = stated_share("psi_f_wb", file)
         low, high = (1.0 - over) / (1.0 + under), (1.0 + over) / (1.0 - under)
     if name == "R_s_ohm":
         devices = 0.0
@@ -402,13 +402,13 @@ def _devices_least_ohm(file: MachineFile) -> float:
 
 def flux_doubt(file: MachineFile) -> float:
     """Return the share (95 %) by which the flux linkage as stated may be wrong, at a temperature that nothing tells."""
-    return math.hypot(_share("psi_f_wb", file)[0], file.machine.alpha_psi_per_k * UNKNOWN_TEMPERATURE_K)
+    return math.hypot(stated_share("psi_f_wb", file)[0], file.machine.alpha_psi_per_k * UNKNOWN_TEMPERATURE_K)
 
 
-def _share(name: str, file: MachineFile) -> tuple[float, str]:
+def stated_share(name: str, file: MachineFile) -> tuple[float, str]:
     """Return the relative tolerance of a stated value: of its deviations where the file has them."""
     if name == RATIO:
-        text = " and ".join(_share(key, file)[1] for key in ("J_kgm2", "psi_f_wb"))
+        text = " and ".join(stated_share(key, file)[1] for key in ("J_kgm2", "psi_f_wb"))
         return 0.0, text
     value = getattr(file.machine, name, None)
     if name in file.std and value:

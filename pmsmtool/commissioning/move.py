@@ -14,7 +14,7 @@ from pmsmtool.axis.move import ENDED, UNITS, MoveResult, Profile, followed, move
 from pmsmtool.axis.search import Box
 from pmsmtool.commissioning.axis_design import axis_drive
 from pmsmtool.commissioning.compared_stage import refuse_inertia
-from pmsmtool.commissioning.contradiction import flux_doubt
+from pmsmtool.commissioning.contradiction import flux_doubt, stated_share
 from pmsmtool.design.design_file import Design
 from pmsmtool.drive.changed_objects import refuse_no_current
 from pmsmtool.drive.envelope import Envelope, largest_acceleration, largest_torque
@@ -24,8 +24,11 @@ from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
 from pmsmtool.errors import ConfigError
 from pmsmtool.experiments.move import MoveProfile, record_move
+from pmsmtool.identification.cogging import PARTIAL, Cogging, save_cogging
 from pmsmtool.identification.completed_machine import PER_PSI, completed_machine
 from pmsmtool.identification.move_mechanics import move_mechanics
+from pmsmtool.identification.partial_cogging import partial_cogging
+from pmsmtool.identification.value_verdict import value_facts
 from pmsmtool.machine.machine_file import MachineFile, dump_machine_file
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.two_masses import mechanics_of
@@ -270,7 +273,7 @@ def plan_move(
         speed_max = SPEED_MARGIN * rad_s_from_rpm(speed)
     envelope = replace(
         allowed, i_max_apk=i_max, speed_max_rad_s=speed_max, duration_s=DURATION_S * times,
-        travel_rad=TRAVEL_MARGIN * abs(way_rad),
+        travel_rad=min(allowed.travel_rad, TRAVEL_MARGIN * abs(way_rad)),
         acceleration_rad_s2=None if design is None else largest_acceleration(design.machine.machine, i_max),
     )  # fmt: skip
     envelope.refuse_gravity()
@@ -324,3 +327,56 @@ def moved_machine(
     assert made is not None
     run.save("machine.toml", dump_machine_file(made))
     return made, {name: made.estimates[name] for ratio, name in PER_PSI.items() if ratio in ratios}
+
+
+CURRENT_SHARE = 0.01
+"""Gain of a drive's current sensors may be off by this (95 %), as `identify` takes it."""
+PEAK = math.sqrt(0.5)
+"""Torque of amperes that are peak, of that of rms ones."""
+CLEARLY = 1.5
+"""Torque that the wrong reading leaves unexplained, of the right one, from which on it is decided."""
+
+
+def inertia_of(source: MachineFile) -> float:
+    """Return the inertia of a machine file (kg m2); raises ConfigError where it has none."""
+    if not source.machine.J_kgm2:
+        raise ConfigError(
+            "cogging needs the inertia of motor and load: it moves the shaft, too", where="[machine] J_kgm2",
+            hint="`pmsmtool move --identify MACHINE -o FILE` finds it by faster moves",
+        )  # fmt: skip
+    return source.machine.J_kgm2
+
+
+def moved_cogging(
+    source: MachineFile, trace: Trace, drive: PositionDrive, run: RunDirectory
+) -> tuple[MachineFile, dict[str, Estimate]]:
+    """Find cogging over the way of slow moves, keep machine file and table in the run, and return it with what it is.
+
+    Raises ConfigError: a machine file without the inertia; IdentificationError: the moves do not show it.
+    """
+    machine, J_kgm2 = source.machine, inertia_of(source)
+    share = math.hypot(flux_doubt(source), CURRENT_SHARE)
+
+    def read_as(scale: float, more: float = 0.0) -> Cogging:
+        return partial_cogging(
+            trace, pole_pairs=machine.pole_pairs, psi_wb=scale * machine.psi_f_wb, J_kgm2=J_kgm2,
+            shares=(share + more, stated_share("J_kgm2", source)[0]),
+        )  # fmt: skip
+
+    found, said = read_as(1.0), []
+    if drive.current_undecided:
+        peak = read_as(PEAK)
+        rms_left, peak_left = (one.part.left_nm if one.part else 0.0 for one in (found, peak))
+        if max(rms_left, peak_left) > CLEARLY * min(rms_left, peak_left):
+            found, kind = (found, "rms") if rms_left < peak_left else (peak, "peak")
+            said = [f"amperes taken as {kind}, by the inertia of the machine file"]
+        else:
+            found, said = read_as(1.0, 1.0 - PEAK), ["amperes may be peak or rms: the interval is that of both"]
+    said = [str(found.part), *said]
+    told = found.estimates()
+    made = replace(source, estimates={**source.estimates, **told}, simulation={})
+    run.save("machine.toml", dump_machine_file(made))
+    files = {"machine.toml": "", **save_cogging(run, found, 1)}
+    values = [{**value_facts(name, estimate), PARTIAL: str(found.part)} for name, estimate in told.items()]
+    run.add(Stage("cogging", "partial", 0.0, values=values, fallbacks=said, files=files, summary=str(found.part)))
+    return made, told

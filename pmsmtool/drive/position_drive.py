@@ -258,7 +258,10 @@ class PositionDrive(TorqueDrive):
         self._taken = []
 
     def end_samples(self) -> Trace:
-        """Bring the drive's process data back; return what was noted: angles from the start (rad), current (A)."""
+        """Bring the drive's process data back; return what was noted: angles from the start (rad), current (A).
+
+        ``start_rad`` of its ``meta`` is the angle that the drive showed at the start.
+        """
         self._recording = False
         sending, self._sending = self._sending, None
         if sending is not None:
@@ -270,7 +273,11 @@ class PositionDrive(TorqueDrive):
             table[:, 0] - table[:1, 0],
             signals,
             units,
-            {"polled": not self.sends, "speed_doubt": self.compared.doubt},
+            {
+                "polled": not self.sends,
+                "speed_doubt": self.compared.doubt,
+                "start_rad": self._angle(self._start_counts),
+            },
         )
 
     def wait(self, seconds: float) -> None:

@@ -39,6 +39,8 @@ MOST_CURRENT = 0.95
 FORETOLD = 1.3
 """Following error of a designed move over the larger end of the predicted one; measured 1.09: the simulated face has
 a filter on its speed that the design does not know."""
+COGGING_WITHIN = 0.10
+"""Amplitude of a cogging of 3 % over half a turn; measured 0.03."""
 PROFILE_WITHIN = 0.03
 """Speed of the drive's own profile from the one asked for, a third of its acceleration; measured 0.004 and 0.005."""
 
@@ -344,3 +346,36 @@ def test_half_a_turn_at_any_speed_on_a_drive_whose_profile_has_no_unit(tool: Too
     profile = json.loads(printed)["profile"]
     assert abs(profile["speed_rad_s"] / rad_s_from_rpm(speed_rpm) - 1.0) < PROFILE_WITHIN
     assert abs(profile["acceleration_rad_s2"] / 600.0 - 1.0) < 3.0 * PROFILE_WITHIN
+
+
+@pytest.mark.chain
+def test_cogging_over_a_part_of_a_turn(tool: Tool, tmp_path: Path) -> None:
+    """Half a turn of a shaft that may not turn round: values and table of it, marked partial in output and report."""
+    known = load_machine_file(machine_path("interior-2k2"))
+    torque_nm = 0.45  # 3 % of the rated one
+    cogs = replace(known, simulation={**known.simulation, "cogging_nm": torque_nm, "cogging_periods": 12})
+    (tmp_path / "cogs.toml").write_text(dump_machine_file(cogs), encoding="utf-8")
+    sim = ("--map", "ingenia", "--sim", f"{tmp_path / 'cogs.toml'}?drive=ingenia&nv={tmp_path / 'axis.nv'}", "--yes")
+    code, printed, said = tool("move", "--by", "180deg", "--cogging", "interior-2k2", *sim, "--json", "-o", "kept.toml")
+    assert code == 0, said
+    assert "travel    198 deg" in said and "warning: partial: over 0." in said
+    data = json.loads(printed)
+    amplitude = data["identified"]["cogging_12_nm"]
+    assert abs(amplitude["value"] - torque_nm) < COGGING_WITHIN * torque_nm and amplitude["fallback"] == "partial"
+    kept = load_machine_file("kept.toml")
+    assert kept.estimates["cogging_12_nm"].fallback == "partial"
+    run = RunDirectory(Path(data["run"]))
+    stage = run.read().stage("cogging")
+    assert stage is not None and stage.status == "partial"
+    assert all(value["partial"].startswith("partial: over 0.") for value in stage.values)
+    theta = np.loadtxt(run.path / "cogging.csv", delimiter=",", skiprows=1)[:, 0]
+    trace = read_trace(run.path / "traces" / "move.npz")
+    shown = trace["theta_m_rad"] + trace.meta["start_rad"]
+    assert shown.min() <= theta[0] and theta[-1] <= shown.max() and np.ptp(theta) > 0.8 * math.pi
+    assert tool("report", data["run"])[0] == 0
+    assert "partial: over 0." in (run.path / "report.html").read_text(encoding="utf-8")
+    assert tool("move", "--by", "180deg", "--cogging", "interior-2k2", "--identify", "interior-2k2", *sim)[0] == 2
+    lacking = replace(known, machine=replace(known.machine, J_kgm2=None))
+    (tmp_path / "lacking.toml").write_text(dump_machine_file(lacking), encoding="utf-8")
+    code, _, said = tool("move", "--by", "90deg", "--cogging", str(tmp_path / "lacking.toml"), *sim)
+    assert code == 2 and "cogging needs the inertia" in said
