@@ -268,11 +268,12 @@ def estimate_mechanics(
     deviations = (widen * np.sqrt(own + share * (1.0 - share) * apart**2 + moved**2 + instead)).tolist()
     J, stds = math.exp(ln_J), (math.exp(ln_J) * deviations[0], deviations[1], deviations[2])
     require_useful(noisy, stds[1], stds[2])
-    drag = None
+    drag, scale_std = None, math.hypot(scale_std, SCALE_FLOOR)
     if share > 0.5:
-        drag = Estimate(float(x_drag[SHAFT]), widen * math.sqrt(of_drag[SHAFT, SHAFT]), 0.0, "N m s2", method=METHOD)
+        size, of_dip = float(x_drag[SHAFT]), 0.5 * falls * float(with_drag.x[SHAFT] - x_drag[SHAFT])
+        std = math.hypot(widen * math.sqrt(of_drag[SHAFT, SHAFT]), of_dip, scale_std * size)
+        drag = Estimate(size, std, tolerance.inertia * size, "N m s2", method=METHOD)
     n = sum(len(block.theta) for block in blocks)
-    scale_std = math.hypot(scale_std, SCALE_FLOOR)
     J_found, B_found, tau_found = (
         Estimate(value, math.hypot(std, scale_std * value), tolerance.inertia * abs(value), unit, n=n, chi2=chi2,
                  method=METHOD, fallback="" if value else f"held at zero: the fit alone has {alone:.2g} {unit}")
