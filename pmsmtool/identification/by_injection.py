@@ -87,7 +87,7 @@ def evaluated_stage(run: RunDirectory, nameplate: MachineFile, request: Identify
             **({"accuracy": accuracy[name]} if name in accuracy else {}),
             **({"bend_per_a": bend_per_a} if name == "L_d_h" and bend_per_a else {}),
         }
-        for name, estimate in (found | timing | kept.ripples()).items()
+        for name, estimate in (found | timing | kept.effects()).items()
     ]
     good = {name: estimate for name, estimate in found.items() if name not in rejected}
     summary = value_verdict.summary_of(kept, good, request.quantities)
@@ -211,7 +211,7 @@ def machine_of(
         estimates={
             **nameplate.estimates,
             **found,
-            **evaluation.ripples(),
+            **evaluation.effects(),
             **{check.name: check.estimate for check in evaluation.checks},
         },
         conditions=dict(conditions),

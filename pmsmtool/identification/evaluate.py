@@ -50,6 +50,7 @@ from pmsmtool.identification.calibration import calibrated_traces
 from pmsmtool.identification.cogging import Cogging, cogging_of
 from pmsmtool.identification.emf_harmonics import EmfHarmonics, harmonics_of
 from pmsmtool.identification.flux_map import flux_map_of, map_estimates
+from pmsmtool.identification.iron_loss import IRON_LOSS, iron_loss_of
 from pmsmtool.identification.mechanics import (
     NOT_RIGID,
     of_no_rigid_shaft,
@@ -163,10 +164,11 @@ class Evaluation:
             found.append(cross_check("L_q_h_apparent", "L_q_h", self.flux.L_q_app, self.inductance.L_q))
         return found
 
-    def ripples(self) -> dict[str, Estimate]:
-        """Return what repeats with the angle of the shaft, by its key: no design depends on it."""
+    def effects(self) -> dict[str, Estimate]:
+        """Return what no design depends on, by its key: what repeats with the shaft's angle, iron loss, drag of air."""
+        losses = {IRON_LOSS: iron_loss_of(self), "drag_nms2": None if self.mechanics is None else self.mechanics.drag}
         found = [part.estimates() for part in (self.harmonics, self.cogging) if part is not None]
-        return {name: estimate for part in found for name, estimate in part.items()}
+        return {k: e for part in found for k, e in part.items()} | {k: e for k, e in losses.items() if e is not None}
 
     def estimates(self) -> dict[str, Estimate]:
         """Return every estimate by its machine-file key."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the instant at which currents are sampled does to the other estimates of a run, and how it is told."""
+"""What the instant at which currents are sampled does to the other estimates of a run."""
 
 from __future__ import annotations
 
@@ -23,8 +23,6 @@ INSTANT = "sampling_instant_s"
 APART_PERIODS = 0.02
 """Standard deviation of instant and lag beside what they do together, which is known better (T_s): a short lag and an
 earlier sample look alike (five late drives: 0.003 to 0.04 T_s off)."""
-TOLD_PERIODS = 0.03
-"""Sampling instant from which on a reader is told that an old encoder angle looks the same (T_s)."""
 
 
 def resistance_as_sampled(
@@ -91,13 +89,3 @@ def with_timing(machine: MachineFile, timing: Mapping[str, Estimate]) -> Machine
     lag_s, instant_s = max(0.0, timing[LAG].value), timing[INSTANT].value
     inverter = replace(machine.inverter, current_lag_s=lag_s, sampling_instant_s=instant_s)
     return replace(machine, inverter=inverter, estimates={**machine.estimates, **timing})
-
-
-def timing_warnings(shown: ShownInstant | None) -> list[str]:
-    """Return what a reader should know about the instant."""
-    if shown is None or abs(shown.value_s) < TOLD_PERIODS * shown.period_s:
-        return []
-    return [
-        f"the d voltage at speed shows currents sampled {1e6 * shown.value_s:+.2g} us beside the middle of the "
-        "zero vector or an encoder angle that is so old; R and L lie in the middle, and both are in the intervals"
-    ]

@@ -23,7 +23,7 @@ from pmsmtool.identification import flux_map, frequency_response
 from pmsmtool.identification.completed_machine import CompletedMachine
 from pmsmtool.identification.evaluate import NOTABLY_WIDER, Evaluation, unseen_current
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
-from pmsmtool.identification.sampling import timing_warnings
+from pmsmtool.identification.iron_loss import LEAST, iron_loss_lines, iron_loss_of, least_ohm
 from pmsmtool.identification.verdicts import KEYS, NOT_ACCEPTED, STEP, Verdicts, verdicts_of
 from pmsmtool.identification.wiring import LINK_AT_REST, SUPPLY, WRONG
 from pmsmtool.machine.machine_file import MachineFile
@@ -150,7 +150,7 @@ def warnings_of(evaluation: Evaluation, request: IdentifyRequest) -> list[str]:
         )
     if evaluation.mechanics is not None and evaluation.mechanics.note:
         lines.append(evaluation.mechanics.note)
-    lines += timing_warnings(evaluation.shown)
+    lines += iron_loss_lines(evaluation)
     lines += [f"{check.name} {check.verdict}; {IF_APART[check.of]}" for check in evaluation.checks if not check.agrees]
     if evaluation.pairs is not None and not evaluation.pairs.judged:
         lines.append("the phases were not compared: the rotor did not come to rest on the three pairs")
@@ -219,6 +219,8 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
     for axis, fit in () if evaluation.inductance is None else evaluation.inductance.axes.items():
         if "eddy" in fit.effects:
             conditions |= {f"eddy_{axis}_s": fit.eddy_s, f"eddy_{axis}_time_s": fit.eddy_tau_s}
+    if (least := least_ohm(evaluation)) and iron_loss_of(evaluation) is None:
+        conditions[LEAST] = least
     if math.isfinite(evaluation.supply_w):
         conditions[SUPPLY] = evaluation.supply_w
     if math.isfinite(evaluation.U_dc_rest_v):

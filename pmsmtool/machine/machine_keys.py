@@ -152,19 +152,21 @@ MEASURABLE: dict[str, Key] = {
 }
 """Keys that ``[std]``, ``[systematic]`` and ``[estimate.<key>]`` may speak of."""
 
-_RIPPLES = {
+_EFFECTS = {
     r"psi_\d+_wb": _key("estimate", "psi_5_wb", "Wb", 0, 100, None, "harmonic of a phase's flux linkage (peak)"),
     r"psi_\d+_rad": _key("estimate", "psi_5_rad", "rad", -_PI2, _PI2, None, "its phase"),
     r"cogging(_\d+)?_nm": _key("estimate", "cogging_nm", "N m", 0, 1e4, None, "cogging torque, largest or of an order"),
     r"cogging_\d+_rad": _key("estimate", "cogging_12_rad", "rad", -_PI2, _PI2, None, "its phase"),
+    "iron_loss_ohm": _key("estimate", "iron_loss_ohm", "ohm", 0, 1e6, None, "iron loss, across the flux voltage"),
+    "drag_nms2": _key("estimate", "drag_nms2", "N m s2", 0, 1e4, None, "drag of air, of the square of the speed"),
 }
-"""What repeats with the angle, by order: keys of ``[estimate.<key>]`` alone."""
+"""What no design depends on, as what repeats with the angle: keys of ``[estimate.<key>]`` alone."""
 
 
 def estimated_key(name: str) -> Key | None:
     """Return the key that ``[estimate.<name>]`` speaks of, a label behind it left out; None: there is none."""
-    ripple = next((key for pattern, key in _RIPPLES.items() if re.fullmatch(pattern, name)), None)
-    return ripple or next((key for k, key in MEASURABLE.items() if name == k or name.startswith(f"{k}_")), None)
+    effect = next((key for pattern, key in _EFFECTS.items() if re.fullmatch(pattern, name)), None)
+    return effect or next((key for k, key in MEASURABLE.items() if name == k or name.startswith(f"{k}_")), None)
 
 
 def deviation_keys(table: str) -> tuple[Key, ...]:

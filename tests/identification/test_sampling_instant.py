@@ -12,7 +12,8 @@ import pytest
 from benchmarks.identification_coverage import drawn, evaluated, measured, threshold_share, truth_of
 from pmsmtool.estimators.estimate import SensorTolerance, total_half_width
 from pmsmtool.identification.evaluate import Evaluation, flux_of
-from pmsmtool.identification.sampling import timing_estimates, timing_warnings
+from pmsmtool.identification.iron_loss import iron_loss_lines
+from pmsmtool.identification.sampling import timing_estimates
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.sim.simulated_machine import Settings
 from pmsmtool.trace import Trace
@@ -52,7 +53,7 @@ def test_the_instant_is_told() -> None:
     # what they do together is known better, where the lag is far below a period
     assert evaluation.shown is not None
     assert instant.value - lag.value == pytest.approx(INSTANT_S - LAG_S, abs=2.0 * evaluation.shown.std_s + 0.1e-6)
-    (line,) = timing_warnings(evaluation.shown)
+    (line,) = iron_loss_lines(evaluation)
     assert "sampled +" in line and "old" in line
 
 

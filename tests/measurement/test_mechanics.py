@@ -86,7 +86,7 @@ def test_the_inertia_is_right_where_i_d_does_not_stay_zero(tmp_path: Path, monke
         drive.close()
     inverter = nameplate.inverter
     evaluation = evaluate(traces, inverter.T_s, T_ref_c=nameplate.machine.T_ref_c, U_dc_v=inverter.U_dc_v).whole()
-    found = evaluation.estimates() | evaluation.ripples()
+    found = evaluation.estimates() | evaluation.effects()
     settings = settings_of(drive_file)
     fifth = found["psi_5_wb"]
     assert fifth.value == pytest.approx(FIFTH_WB, rel=0.05)

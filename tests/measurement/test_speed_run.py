@@ -26,7 +26,8 @@ from pmsmtool.experiments.speed_run import (
     speeds_trace,
     steady_loop,
 )
-from pmsmtool.identification.sampling import timing_estimates, timing_warnings
+from pmsmtool.identification.iron_loss import iron_loss_lines
+from pmsmtool.identification.sampling import timing_estimates
 from pmsmtool.machine.machine_file import MachineFile
 from pmsmtool.measurement.effort import ALL_SPEEDS, SPEED_EFFORTS
 from pmsmtool.measurement.limits import Limits
@@ -105,7 +106,7 @@ def test_a_q_current_that_settles_slowly_does_not_stop_the_shaft() -> None:
     assert float(np.max(np.abs(speeds["i_d_a"]))) > 1.9 * ripple_of(drive)
     assert abs(psi.value / truth["psi_f_wb"] - 1.0) < PSI_LIMIT
     # it samples in time: nothing is warned of, and what an old angle would do to L is in its tolerance
-    assert timing_warnings(evaluation.shown) == []
+    assert iron_loss_lines(evaluation) == []
     instant = timing_estimates(evaluation.inductance, evaluation.shown, SensorTolerance())["sampling_instant_s"]
     assert abs(instant.value) < 2.0 * instant.std
     assert evaluation.inductance is not None and evaluation.resistance is not None

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""Iron loss of whole identifications over CANopen, and what is said where nothing tells it from something else."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+from benchmarks.identification_coverage import drawn, evaluated, measured
+from benchmarks.real_effects import EFFECTS
+from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.identification.evaluate import Evaluation
+from pmsmtool.identification.iron_loss import IRON_LOSS, iron_loss_lines, iron_loss_of, least_ohm
+from pmsmtool.machine.machine_keys import estimated_key
+from pmsmtool.machine.parameters import Estimate
+from pmsmtool.machine.torque import iron_drag
+
+pytestmark = pytest.mark.chain
+
+SEED = 90341
+WIDEST = 0.08
+"""Relative total half width; 0.036 here, to 0.067 on other drives whose L_q is good."""
+
+
+@cache
+def _found(effect: str, level: float) -> tuple[Evaluation, float]:
+    """Evaluation of a drive with one effect, and its iron-loss resistance (ohm)."""
+    drive = drawn("", SEED, "ideal")
+    drive = replace(drive, simulation={**drive.simulation, **EFFECTS[effect][0](drive, level)})
+    traces, nameplate, _ = measured(drive, accuracy=0.01)
+    return evaluated(traces, nameplate), float(drive.simulation_settings()["iron_loss_ohm"])  # type: ignore[arg-type]
+
+
+def test_iron_loss_is_found_within_its_interval() -> None:
+    evaluation, truth = _found("iron loss %", 5.0)
+    found = evaluation.effects()[IRON_LOSS]
+    assert abs(found.value - truth) < total_half_width(found) < WIDEST * found.value
+    assert abs(found.value - truth) < 0.02 * truth  # 0.2 %
+    assert estimated_key(IRON_LOSS), "a machine file takes it"
+
+
+def test_iron_loss_is_named_in_place_of_early_samples() -> None:
+    evaluation, _ = _found("iron loss %", 5.0)
+    (line,) = iron_loss_lines(evaluation)
+    assert line.startswith("iron loss, ") and "+-" in line
+
+
+def test_an_eddy_branch_is_no_iron_loss() -> None:
+    evaluation, _ = _found("eddy branch %", 10.0)
+    assert evaluation.inductance is not None and "eddy" in evaluation.inductance.axes["d"].effects
+    assert iron_loss_of(evaluation) is None and IRON_LOSS not in evaluation.effects()
+    assert iron_loss_lines(evaluation) == []
+
+
+def _shown(evaluation: Evaluation, factor: float) -> Evaluation:
+    assert evaluation.flux is not None and evaluation.flux.shown is not None
+    shown = replace(evaluation.flux.shown, value_s=factor * evaluation.flux.shown.value_s)
+    return replace(evaluation, flux=replace(evaluation.flux, shown=shown))
+
+
+def test_what_both_runs_say_otherwise_is_in_the_interval() -> None:
+    evaluation, truth = _found("iron loss %", 5.0)
+    beside = _shown(evaluation, 1.2)
+    found = iron_loss_of(beside)
+    assert found is not None and abs(found.value - truth) < total_half_width(found)
+    assert iron_loss_of(_shown(evaluation, 0.25)) is None, "another instant may be all of it"
+
+
+@pytest.mark.parametrize(("factor", "told"), [(0.25, "iron loss would"), (-1.0, "encoder angle that is so old")])
+def test_what_is_not_told_apart_is_said(factor: float, told: str) -> None:
+    evaluation, _ = _found("iron loss %", 5.0)
+    hidden, line = iron_loss_lines(_shown(evaluation, factor))
+    assert "eddy currents on d, q, not told from iron loss" in hidden
+    assert told in line and "R and L lie in the middle" not in line
+
+
+def test_the_drag_bounds_the_loss() -> None:
+    """A loss that would brake more than B is none: what brakes less than a hundredth is no contradiction."""
+    evaluation, truth = _found("iron loss %", 5.0)
+    assert evaluation.encoder is not None and evaluation.flux is not None
+    drag = iron_drag(round(evaluation.encoder.pole_pairs.value), evaluation.flux.psi_measured.value, truth)
+    for share, found in ((1.1, True), (0.5, False)):
+        B = Estimate(share * drag, 0.0, 0.0, "N m s")
+        braked = replace(evaluation, mechanics=_Friction(B))  # type: ignore[arg-type]
+        assert least_ohm(braked) == pytest.approx(truth / share, rel=1e-6)
+        assert (iron_loss_of(braked) is not None) == found
+    assert math.isclose(least_ohm(evaluation), 0.0), "without torque pulses there is no bound"
+
+
+class _Friction:
+    """What of the mechanics bounds the loss."""
+
+    drag = None
+
+    def __init__(self, B: Estimate) -> None:
+        self.B = B
