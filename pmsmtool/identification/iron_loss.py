@@ -87,7 +87,7 @@ def iron_loss_lines(result: Evaluation) -> list[str]:
     bound = f"; the resistance of iron loss is at least {format_quantity(least, 'ohm')}, by B" if least else ""
     branch = [a for a, fit in ({} if inductance is None else inductance.axes).items() if "eddy" in fit.effects]
     hidden = bool(branch) and inductance is not None and inductance.sampling is None
-    lines = [f"L: eddy currents on {', '.join(branch)}, not told from iron loss here{bound}"] if hidden else []
+    lines = [f"L: eddy currents on {', '.join(branch)}, not separated from iron loss{bound}"] if hidden else []
     if shown is not None and abs(shown.value_s) >= TOLD_PERIODS * shown.period_s:
         early = f", as a lag of their sensors or iron loss would{'' if hidden else bound}"
         middle = "" if hidden else "; R and L lie in the middle, and both are in the intervals"

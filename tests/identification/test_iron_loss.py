@@ -71,7 +71,7 @@ def test_what_both_runs_say_otherwise_is_in_the_interval() -> None:
 def test_what_is_not_told_apart_is_said(factor: float, told: str) -> None:
     evaluation, _ = _found("iron loss %", 5.0)
     hidden, line = iron_loss_lines(_shown(evaluation, factor))
-    assert "eddy currents on d, q, not told from iron loss" in hidden
+    assert "eddy currents on d, q, not separated from iron loss" in hidden
     assert told in line and "R and L lie in the middle" not in line
 
 
