@@ -258,7 +258,7 @@ def test_traps_are_refused_by_name() -> None:
     assert refusal([*good[:2], *3 * [clipped], *good[5:]]) == "E_CLIPPED"
     stuck = changed(good[1], u_q_v=np.abs(good[1]["u_q_v"]))
     assert refusal([good[0], *3 * [stuck], *good[4:]]) == "E_EXCITATION"
-    assert refusal(good[:2]) == "E_EXCITATION"  # two lines are no plane
+    assert refusal(good[:2]) == "E_NOT_IDENTIFIABLE"  # two lines are no plane: between them a flux falls
     swinging = pulses(0.8)
     frozen = [changed(trace, theta_M_rad=np.full(SAMPLES, trace["theta_M_rad"][0])) for trace in swinging]
     assert refusal(frozen) == "E_MODEL_MISMATCH"
