@@ -148,9 +148,11 @@ def test_samples_are_asked_for_where_they_cannot_be_sent() -> None:
         assert clock.now() - began == pytest.approx(0.02, abs=1e-3)
         drive.wait(0.02)
         assert len(drive._taken) == len(trace) > 20, "one after the other, and none any more at the end"
-        assert trace.t_s[0] == 0.0 and trace.meta == {"polled": True, "speed_doubt": ""}
-        assert trace.units == {"theta_m_rad": "rad", "theta_ref_rad": "rad", "i_q_a": "A"}
         per_count = 2.0 * math.pi / COUNTS
+        start_rad = pytest.approx(1000 * per_count)  # where it was enabled
+        assert trace.t_s[0] == 0.0
+        assert trace.meta == {"polled": True, "speed_doubt": "", "start_rad": start_rad}
+        assert trace.units == {"theta_m_rad": "rad", "theta_ref_rad": "rad", "i_q_a": "A"}
         assert trace["theta_m_rad"][-1] == pytest.approx(1e4 * (trace.t_s[-1] + began) * per_count, rel=0.02)
         assert trace["theta_ref_rad"][-1] == pytest.approx(2e4 * (trace.t_s[-1] + began) * per_count, rel=0.02)
         assert trace["i_q_a"] == pytest.approx(0.5 * RATED_APK)

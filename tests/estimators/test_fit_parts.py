@@ -476,7 +476,9 @@ def test_friction_is_the_mean_of_models_with_and_without_drag(
     assert (found.drag is not None) is bool(p > 0.5) and found.chi2 == 2.0
     if found.drag is not None:
         deviation = np.sqrt(np.linalg.inv(with_drag.jacobian.T @ with_drag.jacobian)[3, 3])
-        assert (found.drag.value, found.drag.std) == pytest.approx((braking[3], math.sqrt(2.0) * deviation), rel=1e-5)
+        std = math.hypot(math.sqrt(2.0) * deviation, scale * braking[3])
+        assert (found.drag.value, found.drag.std) == pytest.approx((braking[3], std), rel=1e-5)
+        assert found.drag.systematic == pytest.approx(0.05 * braking[3], rel=1e-6)
 
 
 SENSORS = SensorTolerance(current_gain=0.03, voltage_gain=0.04)

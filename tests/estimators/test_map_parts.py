@@ -100,8 +100,8 @@ def test_the_deviation_of_a_flux_is_that_of_its_coefficients_its_misfit_the_angl
     q = np.sqrt(of(0, 1) ** 2 + misfit_a**2 * (L_dq**2 + L_qq**2) + 4e-8 + psi_q**2)
     assert fit.flux_std(I_D, I_Q) == pytest.approx(np.stack([d, q]), rel=1e-6)
     h_d, h_q = (
-        np.diff(b)[[int(np.argmax(b > x)) - 1 for x in at]]
-        for b, at in ((SPLINE.breaks_d, I_D), (SPLINE.breaks_q, I_Q))
+        np.diff(b)[[int(np.argmax(b > x)) - 1 for x in at]] * (len(b) - 1) / most
+        for b, at, most in ((SPLINE.breaks_d, I_D, 17), (SPLINE.breaks_q, I_Q, 19))  # those of the finest space
     )
     m_d, m_q = misfit_a * np.hypot(L_dd, L_dq) / h_d, misfit_a * np.hypot(L_dq, L_qq) / h_q
     fitted = np.stack([np.hypot(of(2, 0), m_d), np.sqrt(of(1, 1) ** 2 + m_d * m_q), np.hypot(of(0, 2), m_q)])
