@@ -62,8 +62,10 @@ DROPS_HELD, DROPS_FREE = 2.5, 4.0
 back-emf then makes it creep longer in one direction, which turns the rotor faster still."""
 HALF_PERIODS_LEAST = 14
 """Samples between two turns that a higher voltage for the drop must leave: fewer, and the overshoot is the current."""
-BRAKE_LIMIT_S = 0.6
-BRAKE_LOOK_S = 0.03
+BRAKE_LIMIT_S, BRAKE_MOST_S = 0.6, 35.0
+"""Times without less speed after which a shaft counts as one that does not come to rest, and of braking at the most: a
+heavy shaft that still turned when the first pulse came drove current over the abort limit, and the run was lost."""
+BRAKE_LOOK_S, SLOWER = 0.03, 0.99
 STANDSTILL_SHARE = 0.004
 """Speed that counts as rest, of the largest."""
 FIRST_SHARE = 0.02
@@ -159,15 +161,18 @@ def pulse(
 
 
 def _brake(drive: Drive, omega_e_rad_s: float) -> None:
-    """Bring the shaft to rest, or as near as the limit of time allows."""
+    """Bring the shaft to rest, or as near as it comes."""
     drive.command_speed(0.0)
     periods = max(1, round(0.3 * BRAKE_LOOK_S / drive.period_s))
-    waited = 0.0
-    while waited < BRAKE_LIMIT_S:
+    waited, slower, least = 0.0, 0.0, math.inf
+    while waited - slower < BRAKE_LIMIT_S and waited < BRAKE_MOST_S:
         drive.wait(BRAKE_LOOK_S)
         waited += BRAKE_LOOK_S
-        if abs(drive.average(("omega_e_rad_s",), periods)["omega_e_rad_s"]) <= omega_e_rad_s:
+        omega = abs(drive.average(("omega_e_rad_s",), periods)["omega_e_rad_s"])
+        if omega <= omega_e_rad_s:
             return
+        if omega < SLOWER * least:
+            least, slower = omega, waited
 
 
 def size_axis(drive: Drive, plan: ScanPlan, axis: Axis, abort_speed_rad_s: float) -> AxisPulse:
