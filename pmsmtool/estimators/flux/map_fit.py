@@ -260,17 +260,17 @@ def _fine_fit(
     sigma_a: float,
     magnet: MagnetFlux,
 ) -> CoenergyFit:
-    tried = []
+    tried, weights = [], {id(one.i): whiten(one.i) for one in pulses}  # the same for every space
     for spline in (CoenergySpline.over(i[0], i[1], pieces) for pieces in PIECES):
-        sums = normal_equations(pulses, spline, whiten)
+        sums = normal_equations(pulses, spline, lambda i: weights[id(i)])
         unit = _unit(sums, spline, priors, magnet, sigma_a)
         x, _ = _solve(sums, spline, priors, magnet, unit, even=True)
         tried.append((math.log(sums.squares(x)), PRICE * spline.even().shape[1], unit, spline))
-    alike = correlation(pulses, spline, whiten, x)
+    alike = correlation(pulses, spline, lambda i: weights[id(i)], x)
     *_, unit, spline = min(tried, key=lambda each: sums.n / alike * each[0] + each[1])
     unit *= math.sqrt(alike)
     skew = CoenergySpline.over(i[0], i[1], SKEW_PIECES)
-    with_skew = normal_equations(pulses, spline, whiten, skew)
+    with_skew = normal_equations(pulses, spline, lambda i: weights[id(i)], skew)
     k, own = spline.size, spline.size + len(NUISANCES)
     sums = NormalEquations(with_skew.A[:own, :own], with_skew.b[:own], with_skew.c, with_skew.n)
     x, covariance = _solve(sums, spline, priors, magnet, unit)
