@@ -32,6 +32,7 @@ from pmsmtool.identification.compared_runs import same_drive
 from pmsmtool.identification.evaluate import Evaluation, evaluate, shots_of
 from pmsmtool.identification.fingerprint import STAGE as FINGERPRINT
 from pmsmtool.identification.flux_map import MAP_FILE
+from pmsmtool.identification.iron_loss import IRON_LOSS
 from pmsmtool.identification.request import NAMEPLATE, REQUEST, parse_request, stored_traces
 from pmsmtool.machine.machine_file import load_machine_file
 from pmsmtool.measurement.run_account import account_lines
@@ -52,7 +53,7 @@ NOT_CHECKED = (
     "Continuous torque and temperatures under load.",
 )
 """What a reader of a green report must not assume, besides what was not measured of the machine."""
-EFFECTS = {"cogging_nm": "cogging", "psi_5_wb": "harmonics of the back-EMF"}
+EFFECTS = {"cogging_nm": "cogging", "psi_5_wb": "harmonics of the back-EMF", IRON_LOSS: "iron losses"}
 """Values that show an effect, and what it is called."""
 SERVED = ("socketcand", "virtual", "udp_multicast")
 """Interfaces of python-can behind which another program may stand instead of a drive."""
@@ -110,7 +111,7 @@ def _unmeasured(identified: Stage | None) -> str:
     mapped = any(Path(name).name == MAP_FILE for name in files)
     saturation = "currents of the flux map" if mapped else "bias points that are named"
     lacking = [effect for name, effect in EFFECTS.items() if name not in known]
-    return ", ".join([f"Saturation beyond the {saturation}", *lacking, "slot harmonics of L, iron losses."])
+    return ", ".join([f"Saturation beyond the {saturation}", *lacking, "slot harmonics of L."])
 
 
 def verdict(path: Path) -> Verdict:

@@ -18,6 +18,7 @@ import numpy as np
 from pmsmtool.drive.port import Drive, Excitation, Injection, Shape
 from pmsmtool.errors import LimitExceeded
 from pmsmtool.experiments.signals import readable
+from pmsmtool.experiments.speed_run import RAMP_MOST_S
 from pmsmtool.refusals import refuse
 from pmsmtool.trace import Trace
 
@@ -62,10 +63,10 @@ DROPS_HELD, DROPS_FREE = 2.5, 4.0
 back-emf then makes it creep longer in one direction, which turns the rotor faster still."""
 HALF_PERIODS_LEAST = 14
 """Samples between two turns that a higher voltage for the drop must leave: fewer, and the overshoot is the current."""
-BRAKE_LIMIT_S, BRAKE_MOST_S = 0.6, 35.0
-"""Times without less speed after which a shaft counts as one that does not come to rest, and of braking at the most: a
-heavy shaft that still turned when the first pulse came drove current over the abort limit, and the run was lost."""
-BRAKE_LOOK_S, SLOWER = 0.03, 0.99
+BRAKE_LIMIT_S, SLOWER = 0.6, 0.99
+"""Time in which a shaft must lose a hundredth of its speed, or counts as one that does not come to rest: a heavy one
+that still turned when the first pulse came drove current over the abort limit, and the run was lost."""
+BRAKE_LOOK_S = 0.03
 STANDSTILL_SHARE = 0.004
 """Speed that counts as rest, of the largest."""
 FIRST_SHARE = 0.02
@@ -165,7 +166,7 @@ def _brake(drive: Drive, omega_e_rad_s: float) -> None:
     drive.command_speed(0.0)
     periods = max(1, round(0.3 * BRAKE_LOOK_S / drive.period_s))
     waited, slower, least = 0.0, 0.0, math.inf
-    while waited - slower < BRAKE_LIMIT_S and waited < BRAKE_MOST_S:
+    while waited - slower < BRAKE_LIMIT_S and waited < RAMP_MOST_S:
         drive.wait(BRAKE_LOOK_S)
         waited += BRAKE_LOOK_S
         omega = abs(drive.average(("omega_e_rad_s",), periods)["omega_e_rad_s"])

@@ -399,11 +399,12 @@ def test_axe_core_finds_nothing_serious(made: Path, tmp_path: Path, scheme: str)
             (),
             (),
             (),
-            "bias points that are named, cogging, harmonics of the back-EMF, slot harmonics of L, iron losses.",
+            "bias points that are named, cogging, harmonics of the back-EMF, iron losses, slot harmonics of L.",
         ),
-        (("cogging_nm",), (), (), "named, harmonics of the back-EMF, slot harmonics of L, iron losses."),
-        (("cogging_nm", "psi_5_wb"), (), ("flux_map.npz",), "flux map, slot harmonics of L, iron losses."),
-        (("cogging_nm", "psi_5_wb"), ("cogging_nm",), (), "named, cogging, slot harmonics of L, iron losses."),
+        (("cogging_nm",), (), (), "named, harmonics of the back-EMF, iron losses, slot harmonics of L."),
+        (("cogging_nm", "psi_5_wb", "iron_loss_ohm"), (), (), "named, slot harmonics of L."),
+        (("cogging_nm", "psi_5_wb"), (), ("flux_map.npz",), "flux map, iron losses, slot harmonics of L."),
+        (("cogging_nm", "psi_5_wb"), ("cogging_nm",), (), "named, cogging, iron losses, slot harmonics of L."),
     ],
 )
 def test_the_page_says_unchecked_of_no_effect_that_was_measured(

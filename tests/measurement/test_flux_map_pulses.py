@@ -7,6 +7,7 @@ import pytest
 
 from pmsmtool.drive.port import Drive
 from pmsmtool.experiments import flux_map_scan
+from pmsmtool.experiments.speed_run import RAMP_MOST_S
 
 
 class Braked:
@@ -39,4 +40,4 @@ def test_a_heavy_shaft_is_at_rest_before_the_pulses(rest_rad_s: float, waits_s: 
 def test_a_shaft_that_never_stops_is_waited_for_so_long() -> None:
     drive = Braked(1e6, 5e4)
     flux_map_scan._brake(cast(Drive, drive), 0.0)
-    assert drive.waited <= flux_map_scan.BRAKE_MOST_S + 0.1
+    assert drive.waited <= RAMP_MOST_S + 0.1
