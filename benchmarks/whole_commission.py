@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import math
 import multiprocessing
 import statistics
 import struct
@@ -29,6 +30,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from benchmarks import second_plant
 from benchmarks.commissioning import QUANTITIES, commanded, errors_of, prepared
@@ -70,6 +73,19 @@ def with_devices(drive: MachineFile) -> MachineParameters:
     return replace(drive.machine, R_s_ohm=loop, R_winding_ohm=loop - device_slope_ohm(settings_of(drive)))
 
 
+def seen_factor(drive: MachineFile, name: str) -> float:
+    """Return by how much the mean sensor gains alone make a value wrong (1): what no measurement with them can find.
+
+    Currents read ``g_i`` times too large, and voltages, whose duty cycles are shares of the measured link, ``g_u``.
+    """
+    settings = settings_of(drive)
+    g_i = statistics.fmean(settings.number(f"sensor_gain_{phase}") for phase in "abc")
+    g_u = settings.number("U_dc_gain")
+    if name == "psi_f_wb":
+        return g_u
+    return g_u * g_i if name == "J_kgm2" else g_u / g_i
+
+
 def commission_real(seed: int) -> dict[str, Any]:
     """Commission one drive of the *real* population and return what is judged."""
     drive, effects = draw_real(seed, BLOCKS[seed % len(BLOCKS)])
@@ -101,6 +117,7 @@ def commission_one(seed: int, drive: MachineFile | None = None) -> dict[str, Any
             result["values"] = {
                 name: (error, total_half_width(found[name]) / found[name].value) for name, error in errors.items()
             }
+            result["seen"] = {name: (1.0 + error) / seen_factor(drive, name) - 1.0 for name, error in errors.items()}
         result["told"] = [] if code == 0 else told.strip().splitlines()[-LINES:]
     return {**result, "seconds": time.process_time() - start}
 
@@ -132,24 +149,36 @@ def ended(result: dict[str, Any]) -> str:
 
 
 def summary(results: Sequence[dict[str, Any]]) -> list[str]:
-    """Return counts, failures, and errors against their total intervals."""
+    """Return counts, failures, and errors: against their total intervals, absolute, and seen through the true gains."""
     count = Counter(map(ended, results))
     lines = [f"{len(results)} drives: " + ", ".join(f"{count[word]} {word}" for word in ("PASS", "PARTIAL", "FAIL"))]
     lines.append(f"gate false alarms: {sum(bool(result['alarms']) for result in results)}")
-    lines.append(f"{'quantity':16} {'values':>6} {'median half width %':>19} {'beyond 1x':>9} {'2x':>4} {'3x':>4}")
+    lines.append(
+        f"{'quantity':16} {'values':>6} {'median half width %':>19} {'beyond 1x':>9} {'2x':>4} {'3x':>4}"
+        f" {'p90 of the error %':>18} {'through the gains':>17}"
+    )
     for name in (R_MEASURED, *QUANTITIES):
         pairs = [result["values"][name] for result in results if name in result["values"]]
         if pairs:
             ratios = [abs(error) / half for error, half in pairs]
             beyond = [sum(ratio > times for ratio in ratios) for times in (1, 2, 3)]
             width = 100.0 * statistics.median(half for _, half in pairs)
-            lines.append(f"{name:16} {len(pairs):6d} {width:19.2f} {beyond[0]:9d} {beyond[1]:4d} {beyond[2]:4d}")
+            lines.append(
+                f"{name:16} {len(pairs):6d} {width:19.2f} {beyond[0]:9d} {beyond[1]:4d} {beyond[2]:4d}"
+                f" {_p90([error for error, _ in pairs]):18.2f}"
+                f" {_p90([result['seen'][name] for result in results if name in result.get('seen', {})]):17.2f}"
+            )
     for result in sorted(results, key=lambda each: str(each["stage"])):
         if result["code"]:
             lines.append(f"{result['seed']} {ended(result)} exit {result['code']}, {result['stage'] or 'no stage'}:")
             lines += [f"    {name} {level:.3g}" for name, level in result.get("effects", {}).items()]
             lines += [f"    {line}" for line in result["told"]]
     return lines
+
+
+def _p90(errors: Sequence[float]) -> float:
+    """Return the 90th percentile of the absolute errors (%)."""
+    return float(100.0 * np.quantile(np.abs(errors), 0.9)) if errors else math.nan
 
 
 def read_results(path: Path) -> list[dict[str, Any]]:

@@ -13,6 +13,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from pmsmtool.native import LIBRARY_FOLDER, PAGE_MODULE, library_name
@@ -61,17 +62,19 @@ def build_all(
     A library that is newer than its sources, all headers and the build rules is kept unless ``force`` is set.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    libraries: list[Path] = []
-    for kernel in kernels:
+
+    def built(kernel: Kernel) -> Path | None:
         if not kernel.source_files(package):
             print(f"{kernel.name}: no sources match {', '.join(kernel.sources)}, not built", file=sys.stderr)
-            continue
+            return None
         library = folder / library_name(kernel.name, platform)
         if force or not is_current(library, kernel, package):
             compile_library(compiler, kernel, package, library, platform=platform, strict=strict)
             print(f"{library.name}: compiled by {compiler.name}", file=sys.stderr)
-        libraries.append(library)
-    return libraries
+        return library
+
+    with ThreadPoolExecutor() as pool:  # each compiler is a process of its own
+        return [library for library in pool.map(built, kernels) if library is not None]
 
 
 def build_page_module(package: Path, folder: Path, *, strict: bool = False, force: bool = False) -> list[Path]:
