@@ -92,7 +92,7 @@ def test_random_machines_of_the_box_keep_what_was_asked(family: str, f_a: float,
     K_p, K_i, K_v = (float(made.facts[f"axis_{key}"]) for key in ("K_p_nms_per_rad", "K_i_nm_per_rad", "K_v_per_s"))
     speed = AxisGains(made["speed.K_p_nms_per_rad"], made["speed.K_i_nm_per_rad"], 0.0, notch)
     rng = np.random.default_rng(4)
-    for _ in range(8):
+    for _ in range(4):
         inertia = 1.0 + 1.96 * 0.05 * rng.uniform(-1.0, 1.0)
         shaft = path.shaft.scaled(inertia, 1.0 + 0.03 * rng.uniform(-1.0, 1.0), rng.uniform(0.5, 2.0))
         other = replace(path, shaft=shaft)
@@ -180,8 +180,7 @@ def test_an_integral_time_beyond_its_object_is_the_longest_it_holds(K_i: float, 
 
 
 @pytest.mark.chain
-@pytest.mark.parametrize(("K_p_most", "K_v_most"), [(0.25, 1.0), (1.0, 0.25)])
-def test_a_position_loop_is_no_faster_than_a_speed_loop_that_its_objects_slow(K_p_most: float, K_v_most: float) -> None:
+def test_a_position_loop_is_no_faster_than_a_speed_loop_that_its_objects_slow() -> None:
     """K_v stayed as designed over a K_p that its object cut: 23.8 degrees on a Copley."""
 
     def design(K_p: float, K_v: float) -> Design:
@@ -193,10 +192,11 @@ def test_a_position_loop_is_no_faster_than_a_speed_loop_that_its_objects_slow(K_
         return design_axis(machine(0.0, 0.0), TuneRequest(), ASKED, own)
 
     whole = design(10.0, 1000.0)
-    cut = design(K_p_most * whole[SPEED[0]], K_v_most * whole[CASCADE[0]])
-    assert cut[CASCADE[0]] == pytest.approx(0.25 * whole[CASCADE[0]], rel=1e-3)
-    assert cut[SPEED[0]] == pytest.approx(K_p_most * whole[SPEED[0]], rel=1e-3)
-    assert cut.facts["axis_margins_kept"]
+    for K_p_most, K_v_most in ((0.25, 1.0), (1.0, 0.25)):
+        cut = design(K_p_most * whole[SPEED[0]], K_v_most * whole[CASCADE[0]])
+        assert cut[CASCADE[0]] == pytest.approx(0.25 * whole[CASCADE[0]], rel=1e-3)
+        assert cut[SPEED[0]] == pytest.approx(K_p_most * whole[SPEED[0]], rel=1e-3)
+        assert cut.facts["axis_margins_kept"]
 
 
 @pytest.mark.chain
