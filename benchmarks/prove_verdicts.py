@@ -205,7 +205,7 @@ def proven(
         return proving.prove_stage(run, drive, design, asked, lambda lines: None, log)
 
 
-KEPT = 6
+KEPT = 16
 """Predictions that are kept."""
 
 
