@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,13 @@ def identified() -> MachineFile:
     return replace(machine, inverter=replace(machine.inverter, V_dead_v=13.76, i_knee_apk=0.2), simulation={})
 
 
+@cache
+def observed(by: str) -> tuple[Trace, float]:
+    """Observations of a drive in operation, and the true R at the end."""
+    with sim_bench() as bench:
+        return operated(bench, by)
+
+
 def operated(bench: SimBench, by: str) -> tuple[Trace, float]:
     """Track while the machine is driven through the points; returns the observations and the true R at the end."""
     core = bench.session.hardware.core  # type: ignore[attr-defined]
@@ -79,10 +87,10 @@ def operated(bench: SimBench, by: str) -> tuple[Trace, float]:
 @pytest.mark.chain
 @pytest.mark.parametrize("by", ["pdo", "trace"])
 def test_a_machine_in_operation_is_followed(by: str, tmp_path: Path) -> None:
+    observations, truth = observed(by)
+    known = known_of(identified(), compensated=False)
+    found = follow(observations, known, identified())
     with sim_bench() as bench:
-        observations, truth = operated(bench, by)
-        known = known_of(identified(), compensated=False)
-        found = follow(observations, known, identified())
         run = begin_run(bench.drive, tmp_path)
     off = found.track.value["R_s_ohm"][-1] - truth
     assert abs(off) < 3.0 * found.track.std["R_s_ohm"][-1] and abs(off) < R_WITHIN * truth
@@ -154,8 +162,8 @@ def test_a_machine_at_rest_shows_nothing_and_is_refused(here: Path, capsys: pyte
 
 @pytest.mark.chain
 def test_replay_from_the_command_line(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    observations, _ = observed("trace")
     with sim_bench() as bench:
-        observations, _ = operated(bench, "trace")
         run = begin_run(bench.drive, here / "runs")
     keep(run, observations, known_of(identified(), compensated=False))
     (run.path / "machine.toml").write_text(dump_machine_file(identified()))
@@ -175,12 +183,10 @@ def test_a_run_of_another_command_is_refused_by_name(
 ) -> None:
     """Identification's traces have voltages, currents and speed too, and still give no number."""
     with sim_bench() as bench:
-        observations, _ = operated(bench, "trace") if recorded else (None, None)
         run: RunDirectory = begin_run(bench.drive, here / "runs")
     shutil.copy(data_folder("profiles") / "interior-2k2.toml", run.path / "machine.toml")
     for name in recorded:
-        assert observations is not None
-        run.save(f"traces/{name}.npz", trace_npz(observations))
+        run.save(f"traces/{name}.npz", trace_npz(observed("trace")[0]))
     assert program(["track", "--replay", str(run.path)]) == 9
     printed = capsys.readouterr()
     assert printed.out == "" and "no observations of `track` (traces/track.npz)" in printed.err
