@@ -47,25 +47,25 @@ def test_list_names_every_figure(pmsmtool: Command) -> None:
 
 @pytest.mark.chain
 def test_tables_go_to_stdout_and_files_hold_the_same_bytes_twice(pmsmtool: Command, tmp_path: Path) -> None:
-    done = pmsmtool("jercic-fig12", "-o", str(tmp_path / "one"))
+    done = pmsmtool("miyajima-fig7", "-o", str(tmp_path / "one"))
     assert done.exit_code == 0, done.stderr
     assert "checked numbers: printed in the paper, or expected" in done.stdout
-    assert "predicted excess" in done.stdout
+    assert "worst step; ideal inverter" in done.stdout
     assert "wrote" in done.stderr
     assert "wrote" not in done.stdout
     written = {path.suffix: path for path in sorted((tmp_path / "one").iterdir())}
-    assert [path.name for path in written.values()] == [f"jercic-fig12.{end}" for end in ("csv", "json", "svg", "txt")]
+    assert [path.name for path in written.values()] == [f"miyajima-fig7.{end}" for end in ("csv", "json", "svg", "txt")]
     stored = json.loads(written[".json"].read_text(encoding="utf-8"))
     assert stored["schema"] == "pmsmtool.reproduce/1"
     assert stored["ok"] is True
-    assert len(stored["panels"][0]["series"][0]["x"]) == 19200
+    assert len(stored["panels"][0]["series"][0]["x"]) == 850
 
     asked = {end: tmp_path / f"two{end}" for end in (".csv", ".svg")}
-    done = pmsmtool("jercic-fig12", "--json", "-o", str(asked[".csv"]), "--plot", str(asked[".svg"]))
+    done = pmsmtool("miyajima-fig7", "--json", "-o", str(asked[".csv"]), "--plot", str(asked[".svg"]))
     data = json.loads(done.stdout)
-    assert data["name"] == "jercic-fig12"
+    assert data["name"] == "miyajima-fig7"
     assert all(check["within"] for check in data["checks"])
-    assert data["tables"][1]["units"] == ["rpm/s", "%", "%"]
+    assert data["tables"][0]["units"][:4] == ["", "%", "ms", "A"]
     assert all(path.read_bytes() == written[end].read_bytes() for end, path in asked.items())
     assert asked[".csv"].read_text(encoding="utf-8").startswith("panel,series,x,y")
     assert asked[".svg"].read_text(encoding="utf-8").startswith("<?xml")

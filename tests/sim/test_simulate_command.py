@@ -6,10 +6,13 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from pmsmtool.cli.main import run
 from pmsmtool.files import data_folder
 from pmsmtool.params.parameter_set import ParameterSet
 from pmsmtool.report.plots import POINTS_MAX, Panel, thinned, trace_figure
@@ -18,11 +21,23 @@ from pmsmtool.trace import Trace, read_trace
 pytestmark = pytest.mark.chain
 
 
-def pmsmtool(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "pmsmtool", *arguments], capture_output=True, text=True, check=False)
+Program = Callable[..., SimpleNamespace]
 
 
-def test_writes_trace_and_figure_the_same_bytes_twice(tmp_path):
+@pytest.fixture
+def pmsmtool(capsys: pytest.CaptureFixture[str]) -> Program:
+    """The program in this process; a start of its own is below."""
+
+    def call(*arguments: str) -> SimpleNamespace:
+        capsys.readouterr()
+        code = run(list(arguments))
+        said = capsys.readouterr()
+        return SimpleNamespace(returncode=int(code), stdout=said.out, stderr=said.err)
+
+    return call
+
+
+def test_writes_trace_and_figure_the_same_bytes_twice(pmsmtool, tmp_path):
     for name in ("first", "second"):
         done = pmsmtool(
             "simulate", "interior-2k2", "--scenario", "q-step", "-o", str(tmp_path / f"{name}.npz"),
@@ -37,7 +52,7 @@ def test_writes_trace_and_figure_the_same_bytes_twice(tmp_path):
     assert len(read_trace(tmp_path / "first.npz")) == 600
 
 
-def test_csv_holds_the_same_numbers(tmp_path):
+def test_csv_holds_the_same_numbers(pmsmtool, tmp_path):
     for name in ("t.npz", "t.csv"):
         assert pmsmtool("simulate", "interior-2k2", "--scenario", "q-step", "-o", str(tmp_path / name)).returncode == 0
     npz, csv = read_trace(tmp_path / "t.npz"), read_trace(tmp_path / "t.csv")
@@ -46,7 +61,7 @@ def test_csv_holds_the_same_numbers(tmp_path):
     assert npz.meta == csv.meta
 
 
-def test_json_is_one_object_and_needs_no_file(tmp_path):
+def test_json_is_one_object_and_needs_no_file(pmsmtool, tmp_path):
     done = pmsmtool("simulate", "interior-2k2", "--scenario", "q-step", "--json", "--set", "sensor_noise_apk=0")
     data = json.loads(done.stdout)
     assert data["schema"] == "pmsmtool.simulate/1"
@@ -56,7 +71,7 @@ def test_json_is_one_object_and_needs_no_file(tmp_path):
     assert data["meta"]["event_overruns"] == 0
 
 
-def test_duration_and_scenario_file(tmp_path):
+def test_duration_and_scenario_file(pmsmtool, tmp_path):
     scenario = tmp_path / "still.toml"
     scenario.write_text(
         'schema = "pmsmtool.scenario/1"\nduration_s = 1.0\nmode = "current"\nrotor = "locked"\n', encoding="utf-8"
@@ -81,7 +96,7 @@ def test_duration_and_scenario_file(tmp_path):
         (("--scenario", "q-step", "-o", "/nonexistent/t.npz"), "cannot be written"),
     ],
 )
-def test_bad_use_is_exit_2_with_one_clear_message(arguments, said, tmp_path, monkeypatch):
+def test_bad_use_is_exit_2_with_one_clear_message(pmsmtool, arguments, said, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = pmsmtool("simulate", "interior-2k2", *arguments)
     assert done.returncode == 2
@@ -90,7 +105,7 @@ def test_bad_use_is_exit_2_with_one_clear_message(arguments, said, tmp_path, mon
     assert not list(tmp_path.iterdir())
 
 
-def test_what_the_design_has_to_say_is_said(tmp_path):
+def test_what_the_design_has_to_say_is_said(pmsmtool, tmp_path):
     machine = (data_folder("profiles") / "interior-2k2.toml").read_text(encoding="utf-8")
     kept = [line for line in machine.splitlines() if not line.startswith("J_kgm2")]
     (tmp_path / "machine.toml").write_text("\n".join(kept), encoding="utf-8")
@@ -101,19 +116,19 @@ def test_what_the_design_has_to_say_is_said(tmp_path):
     assert "speed control is off" in done.stderr
 
 
-def test_design_is_needed():
+def test_design_is_needed(pmsmtool):
     done = pmsmtool("simulate", "--scenario", "q-step", "--json")
     assert done.returncode == 2
     assert "missing argument DESIGN" in done.stderr
 
 
-def test_unknown_design_is_exit_2():
+def test_unknown_design_is_exit_2(pmsmtool):
     done = pmsmtool("simulate", "nothing-here", "--scenario", "q-step", "--json")
     assert done.returncode == 2
     assert "nothing-here" in done.stderr
 
 
-def test_trip_is_a_warning_with_its_time(tmp_path):
+def test_trip_is_a_warning_with_its_time(pmsmtool, tmp_path):
     params = ParameterSet({"protection.i_trip_apk": 4.0, "field_weakening.mode": 0})
     (tmp_path / "params.toml").write_text(params.to_toml(), encoding="utf-8")
     done = pmsmtool(
@@ -125,7 +140,7 @@ def test_trip_is_a_warning_with_its_time(tmp_path):
     assert "field weakening is off" in done.stderr
 
 
-def test_list_names_the_scenarios():
+def test_list_names_the_scenarios(pmsmtool):
     done = pmsmtool("simulate", "--list")
     assert done.returncode == 0
     assert "load-step" in done.stdout
@@ -152,7 +167,7 @@ def test_a_simulation_imports_what_it_needs_and_is_not_searched_for_garbage():
     assert done.stdout.strip() == "[] 0"
 
 
-def test_help_has_examples():
+def test_help_has_examples(pmsmtool):
     assert "Examples" in pmsmtool("simulate", "--help").stdout
 
 
