@@ -10,6 +10,7 @@ import pytest
 from benchmarks.identification_coverage import drawn, evaluated, measured
 from benchmarks.real_effects import EFFECTS
 from pmsmtool.estimators.estimate import total_half_width
+from pmsmtool.estimators.injection.sampling_instant import Sampling
 from pmsmtool.identification.evaluate import Evaluation
 from pmsmtool.identification.iron_loss import IRON_LOSS, iron_loss_lines, iron_loss_of, least_ohm
 from pmsmtool.machine.machine_keys import estimated_key
@@ -24,16 +25,16 @@ WIDEST = 0.08
 
 
 @cache
-def _found(effect: str, level: float) -> tuple[Evaluation, float]:
-    """Evaluation of a drive with one effect, and its iron-loss resistance (ohm)."""
+def _found() -> tuple[Evaluation, float]:
+    """Evaluation of a drive with iron loss, and its iron-loss resistance (ohm)."""
     drive = drawn("", SEED, "ideal")
-    drive = replace(drive, simulation={**drive.simulation, **EFFECTS[effect][0](drive, level)})
+    drive = replace(drive, simulation={**drive.simulation, **EFFECTS["iron loss %"][0](drive, 5.0)})
     traces, nameplate, _ = measured(drive, accuracy=0.01)
     return evaluated(traces, nameplate), float(drive.simulation_settings()["iron_loss_ohm"])  # type: ignore[arg-type]
 
 
 def test_iron_loss_is_found_within_its_interval() -> None:
-    evaluation, truth = _found("iron loss %", 5.0)
+    evaluation, truth = _found()
     found = evaluation.effects()[IRON_LOSS]
     assert abs(found.value - truth) < total_half_width(found) < WIDEST * found.value
     assert abs(found.value - truth) < 0.02 * truth  # 0.2 %
@@ -41,16 +42,9 @@ def test_iron_loss_is_found_within_its_interval() -> None:
 
 
 def test_iron_loss_is_named_in_place_of_early_samples() -> None:
-    evaluation, _ = _found("iron loss %", 5.0)
+    evaluation, _ = _found()
     (line,) = iron_loss_lines(evaluation)
     assert line.startswith("iron loss, ") and "+-" in line
-
-
-def test_an_eddy_branch_is_no_iron_loss() -> None:
-    evaluation, _ = _found("eddy branch %", 10.0)
-    assert evaluation.inductance is not None and "eddy" in evaluation.inductance.axes["d"].effects
-    assert iron_loss_of(evaluation) is None and IRON_LOSS not in evaluation.effects()
-    assert iron_loss_lines(evaluation) == []
 
 
 def _shown(evaluation: Evaluation, factor: float) -> Evaluation:
@@ -59,8 +53,20 @@ def _shown(evaluation: Evaluation, factor: float) -> Evaluation:
     return replace(evaluation, flux=replace(evaluation.flux, shown=shown))
 
 
+def test_an_eddy_branch_is_no_iron_loss() -> None:
+    """Of the rotor: the square waves show it, a turning machine does not, and the instant of sampling is known."""
+    evaluation, _ = _found()
+    assert evaluation.inductance is not None and "eddy" in evaluation.inductance.axes["d"].effects
+    still = _shown(evaluation, 0.0)
+    assert iron_loss_of(still) is None and IRON_LOSS not in still.effects()
+    timed = replace(still, inductance=replace(evaluation.inductance, sampling=Sampling()))
+    assert iron_loss_of(timed) is None and iron_loss_lines(timed) == []
+    early = replace(evaluation, inductance=timed.inductance)
+    assert iron_loss_of(early) is None, "what is known to be early samples is no loss"
+
+
 def test_what_both_runs_say_otherwise_is_in_the_interval() -> None:
-    evaluation, truth = _found("iron loss %", 5.0)
+    evaluation, truth = _found()
     beside = _shown(evaluation, 1.2)
     found = iron_loss_of(beside)
     assert found is not None and abs(found.value - truth) < total_half_width(found)
@@ -69,7 +75,7 @@ def test_what_both_runs_say_otherwise_is_in_the_interval() -> None:
 
 @pytest.mark.parametrize(("factor", "told"), [(0.25, "iron loss would"), (-1.0, "encoder angle that is so old")])
 def test_what_is_not_told_apart_is_said(factor: float, told: str) -> None:
-    evaluation, _ = _found("iron loss %", 5.0)
+    evaluation, _ = _found()
     hidden, line = iron_loss_lines(_shown(evaluation, factor))
     assert "eddy currents on d, q, not separated from iron loss" in hidden
     assert told in line and "R and L lie in the middle" not in line
@@ -77,7 +83,7 @@ def test_what_is_not_told_apart_is_said(factor: float, told: str) -> None:
 
 def test_the_drag_bounds_the_loss() -> None:
     """A loss that would brake more than B is none: what brakes less than a hundredth is no contradiction."""
-    evaluation, truth = _found("iron loss %", 5.0)
+    evaluation, truth = _found()
     assert evaluation.encoder is not None and evaluation.flux is not None
     drag = iron_drag(round(evaluation.encoder.pole_pairs.value), evaluation.flux.psi_measured.value, truth)
     for share, found in ((1.1, True), (0.5, False)):
