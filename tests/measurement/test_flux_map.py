@@ -75,7 +75,8 @@ def test_a_free_rotor_gives_a_map_that_a_replay_repeats(tmp_path: Path) -> None:
         record = new_record(["test"], drive={}, bus={}, versions={}, operator="nobody")
         run = RunDirectory.create(tmp_path, drive.identity.serial, record)
         said: list[str] = []
-        request = IdentifyRequest(("psi",), i_max_apk=20.0, map_if_saturated=True)  # as `commission` asks
+        # as `commission --accuracy 0.01` asks
+        request = IdentifyRequest(("psi",), i_max_apk=20.0, map_if_saturated=True, accuracy=0.01)
         nameplate = nameplate_of(drive, "bench")
         stage = identify(run, drive, request, said.extend, said.append, known=(nameplate, "bench"))
         run.add(stage)

@@ -41,11 +41,15 @@ CHANNEL = "interior-2k2?nv=:memory:"
 
 
 def identified(
-    drive: CanopenDrive, folder: Path, quantities: tuple[str, ...], tolerance: SensorTolerance | None = None
+    drive: CanopenDrive,
+    folder: Path,
+    quantities: tuple[str, ...],
+    tolerance: SensorTolerance | None = None,
+    accuracy: float | None = None,
 ) -> tuple[RunDirectory, Stage]:
     record = new_record(["test"], drive={}, bus={}, versions={}, operator="nobody")
     run = RunDirectory.create(folder, drive.identity.serial, record)
-    request = IdentifyRequest(quantities=quantities, tolerance=tolerance or SensorTolerance())
+    request = IdentifyRequest(quantities=quantities, tolerance=tolerance or SensorTolerance(), accuracy=accuracy)
     stage = identify(run, drive, request, lambda lines: None, lambda text: None)
     run.add(stage)
     return run, stage
@@ -113,7 +117,7 @@ def test_a_speed_limit_that_tells_nothing_is_refused_before_anybody_is_asked(tmp
     assert asked == []
 
 
-# ---- a rotor that leaves the turning vector ------------------------------------------------------------------------
+# ---- a rotor on the turning vector ---------------------------------------------------------------------------------
 
 
 def test_the_shaft_turns_no_faster_than_allowed_while_its_pole_pairs_are_counted(tmp_path: Path) -> None:
@@ -130,13 +134,10 @@ def test_the_shaft_turns_no_faster_than_allowed_while_its_pole_pairs_are_counted
     assert 0.0 < np.max(np.abs(speeds)) < allowed
 
 
-@pytest.mark.parametrize("seed", [0, 2])
-def test_a_reluctance_machine_follows_a_smaller_and_slower_vector(seed: int, tmp_path: Path) -> None:
-    """Its rotor leaves the first vector. Of 14 drives of this kind 13 leave the first and one of them the second; with
-    one pace for all tries seeds 0 and 2 were refused.
-    """
+def test_a_reluctance_machine_follows_the_first_vector(tmp_path: Path) -> None:
+    """On the largest one alone it rests 44 degrees beside it."""
     base = load_machine_file(data_folder("profiles") / "saturated-pmsyrm.toml")
-    drive_file = draw_around(replace(base, simulation={"inverter_model": "switched"}), seed, spread=0.1)
+    drive_file = draw_around(replace(base, simulation={"inverter_model": "switched"}), 0, spread=0.1)
     path = tmp_path / "drive.toml"
     path.write_text(dump_machine_file(drive_file, embed_flux_map=True), encoding="utf-8")
     with Connection(PmsmSimBus(f"{path}?nv=:memory:")) as connection:
@@ -154,7 +155,7 @@ def test_a_machine_without_magnets_is_named_and_the_rest_identified(tmp_path: Pa
     """A vector pulls the axis of the larger inductance onto itself, so that is L_d; both within 0.2 %."""
     with Connection(PmsmSimBus(f"{CHANNEL}&psi_f_wb=0&L_q_h=0.12")) as connection:
         drive = CanopenDrive(connection, 1)
-        run, stage = identified(drive, tmp_path, ("poles", "R", "L", "psi"))
+        run, stage = identified(drive, tmp_path, ("poles", "R", "L", "psi"), accuracy=0.01)
         drive.close()
     assert stage.status == "partial" and stage.refused["psi"].startswith("E_NO_MAGNET")
     found = load_machine_file(run.path / MACHINE)
@@ -173,7 +174,7 @@ def test_the_gains_of_another_motor_serve_nobody(factor: float, quantities: tupl
         drive.write({"motor.L_d_h": 0.01 * factor, "motor.L_q_h": 0.01 * factor})
         names += ["motor.L_d_h", "motor.L_q_h"]
         held = [drive.read(name) for name in names]
-        _, stage = identified(drive, tmp_path, quantities)
+        _, stage = identified(drive, tmp_path, quantities, accuracy=0.01 if "L" in quantities else None)
         assert stage.status == "pass" and not stage.refused
         assert [drive.read(name) for name in names] == held
         drive.close()

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 
 from pmsmtool.bus.connect import Connection
 from pmsmtool.cli.main import cli
@@ -28,16 +28,16 @@ from pmsmtool.drive_maps.shipped_maps import load_family
 from pmsmtool.errors import Interrupted, NotAvailable, Partial
 from pmsmtool.estimators.estimate import total_half_width
 from pmsmtool.estimators.recorded_push import DELAY_DOUBT, estimate_pushes
-from pmsmtool.identification.by_pulses import PulseResult, pulse_result
-from pmsmtool.identification.request import Method
+from pmsmtool.identification.by_pulses import PulseResult, pulse_result, read_facts
+from pmsmtool.identification.request import Method, stored_traces
 from pmsmtool.machine.machine_file import load_machine_file, machine_path
-from pmsmtool.measurement.by_pulses import swing_and_record
 from pmsmtool.measurement.capabilities import Capabilities, CapabilityLevel, examine
 from pmsmtool.measurement.identify import open_for_level
+from pmsmtool.run_directory import RunDirectory
 from pmsmtool.sim.bus import PmsmSimBus
 from pmsmtool.trace import Trace
 
-pytestmark = [pytest.mark.chain, pytest.mark.usefixtures("undrawn")]
+pytestmark = pytest.mark.chain
 
 Pushed = tuple[MappedRecorderDrive, PulseResult, list[Trace]]
 
@@ -110,15 +110,26 @@ def test_a_drive_that_does_not_have_what_its_map_says_is_no_recorder(tmp_path: P
 
 
 @pytest.fixture(scope="module")
-def pushed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pushed]:
-    with opened(tmp_path_factory.mktemp("mapped"), completed()) as (connection, found):
+def commissioned(tmp_path_factory: pytest.TempPathFactory) -> tuple[Result, RunDirectory]:
+    """The whole chain."""
+    folder = tmp_path_factory.mktemp("mapped")
+    path = folder / "map.toml"
+    path.write_text(completed(), encoding="utf-8")
+    bus = ["-i", "pmsmsim", "-c", f"interior-2k2?nv=:memory:&drive={path}"]
+    asked = ["commission", str(machine_path("interior-2k2")), "--map", str(path), "--runs", str(folder / "runs")]
+    result = CliRunner().invoke(cli, [*bus, *asked, "--speed-max", "3000rpm", "--yes"])  # a Copley limits no speed
+    return result, RunDirectory(next((folder / "runs").iterdir()))
+
+
+@pytest.fixture(scope="module")
+def pushed(commissioned: tuple[Result, RunDirectory], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pushed]:
+    """Its pushes, and a drive of its kind."""
+    run = commissioned[1]
+    traces = {name: trace for name, trace in stored_traces(run).items() if name.startswith("push_")}
+    with opened(tmp_path_factory.mktemp("opened"), completed()) as (connection, found):
         drive = open_for_level(connection, 1, found)
         assert isinstance(drive, MappedRecorderDrive)
-        envelope = Envelope(i_max_apk=7.0, speed_max_rad_s=280.0, duration_s=600.0)
-        traces: dict[str, Trace] = {}
-        facts = swing_and_record(drive, envelope, traces.__setitem__, lambda text: None)
-        yield drive, pulse_result(traces, facts), list(traces.values())
-        assert is_safe(drive.node.state())
+        yield drive, pulse_result(traces, read_facts(run)), list(traces.values())
         drive.close()
 
 
@@ -163,6 +174,7 @@ def test_that_nobody_says_which_period_a_voltage_belongs_to_widens_the_resistanc
 def test_samples_at_the_largest_voltage_are_marked(pushed: Pushed, monkeypatch: pytest.MonkeyPatch) -> None:
     """The link of 540 V gives 312 V at most: 95 % of them are 296 V."""
     drive = pushed[0]
+    monkeypatch.setattr(drive, "coast", lambda: None)
     u_q_v = np.array([0.0, 290.0, -295.0, -297.5, 310.0])
     columns = {"u_d_v": np.zeros(5), "u_q_v": u_q_v}
     trace = Trace(1e-4 * np.arange(5), columns, dict.fromkeys(columns, "V"), {})
@@ -188,20 +200,14 @@ def test_what_it_does_not_show_or_take_is_said(pushed: Pushed) -> None:
         drive.record(("i_q_a",), 10, excitation=step)
 
 
-def test_the_chain_measures_by_it_and_says_what_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PMSMTOOL_HOME", str(tmp_path / "home"))
-    path = tmp_path / "map.toml"
-    path.write_text(completed(), encoding="utf-8")
-    bus = ["-i", "pmsmsim", "-c", f"interior-2k2?nv=:memory:&drive={path}"]
-    asked = ["commission", str(machine_path("interior-2k2")), "--map", str(path), "--runs", str(tmp_path / "runs")]
-    result = CliRunner().invoke(cli, [*bus, *asked, "--speed-max", "3000rpm", "--yes"])  # a Copley limits no speed
+def test_the_chain_measures_by_it_and_says_what_is_left(commissioned: tuple[Result, RunDirectory]) -> None:
+    result, run = commissioned
     assert result.exit_code == Partial.exit_code, result.output
     assert "recorded torque pulses" in result.output
     for line in ("identify  PASS", "flash     PASS", "verify    PASS", "prove     NOT AVAILABLE"):
         assert line in result.output
     assert "SIMULATED DRIVE, PARTIAL: 4 of 7 stages ran" in result.output
-    machine_file = load_machine_file(next((tmp_path / "runs").glob("*/machine.toml")))
-    measured = machine_file.machine.R_s_ohm
+    measured = load_machine_file(run.path / "machine.toml").machine.R_s_ohm
     assert measured != 3.6 and measured == pytest.approx(3.6, rel=0.05)
 
 

@@ -187,9 +187,7 @@ def test_a_heavy_load_that_would_swing_for_minutes_is_braked(
     assert waited < REST_LIMIT_S + BRAKED_S
 
 
-@pytest.mark.parametrize(
-    ("swing_rad_s", "bits"), [(1.7, 12), (3.0, 10), (3.7, 12), (10.0, 10), (30.0, 10), (100.0, 12)]
-)
+@pytest.mark.parametrize(("swing_rad_s", "bits"), [(1.7, 12), (3.0, 10), (10.0, 10), (100.0, 12)])
 def test_a_heavy_load_swings_from_step_to_step(swing_rad_s: float, bits: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """8 to 26 rotors of load, 1 % of friction: behind a vector that turns by itself they swung by 50 to 180 degrees.
 
