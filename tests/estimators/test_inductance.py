@@ -375,7 +375,6 @@ def _move(t: Trace) -> dict[str, np.ndarray]:
         (lambda t: {"flagged": np.r_[1.0, np.zeros(len(t) - 1)]}, "E_CLIPPED"),
         (lambda t: {"i_d_a": np.full(len(t), np.mean(t["i_d_a"]))}, "E_EXCITATION"),
         (lambda t: {"i_d_a": np.random.default_rng(1).normal(0, np.ptp(t["i_d_a"]), len(t))}, "E_MODEL_MISMATCH"),
-        (lambda t: {"i_d_a": np.clip(t["i_d_a"], None, np.mean(t["i_d_a"]))}, "E_MODEL_MISMATCH"),
     ],
 )
 def test_refusals(plain: Shots, change: Change, reason: str) -> None:
