@@ -297,7 +297,7 @@ def _tell(
 ) -> Mapping[str, Mapping[str, Any]]:
     """Tell what a stage holds, also one that an error ``ended``; return what became of the accuracy asked for."""
     from pmsmtool.identification.request import accuracy_line, accuracy_told
-    from pmsmtool.report.report import INTEGER, total_interval
+    from pmsmtool.report.report import INTEGER, is_integer, total_interval
     from pmsmtool.report.verdict import on_which_drive
 
     rows = []
@@ -307,7 +307,7 @@ def _tell(
             rows.append((value["name"], told, "no interval", "", "", value.get("method", value["source"])))
             continue
         total = total_interval(value["std"], value["systematic"], value["coverage_factor"])
-        whole = total == 0.0
+        whole = is_integer(float(value["value"]), total)
         rows.append(
             (
                 value["name"],

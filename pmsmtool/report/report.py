@@ -234,7 +234,7 @@ def _estimate_row(value: Mapping[str, Any]) -> list[Cell]:
         conditions.append("i_d {:.3g}, i_q {:.3g} A pk".format(*bias))
     parts = (format_estimate(float(value["value"]), total, unit),
              *(format_quantity(float(value[key]), unit, 2) for key in ("std", "systematic")))  # fmt: skip
-    if total == 0.0:
+    if is_integer(float(value["value"]), total):
         parts = f"{value['value']:.0f}", INTEGER, ""
     return [
         (value["name"], ""),
@@ -246,6 +246,11 @@ def _estimate_row(value: Mapping[str, Any]) -> list[Cell]:
 
 INTEGER = "an integer"
 """In place of the interval of pole pairs: they are that, or refused."""
+
+
+def is_integer(value: float, total: float) -> bool:
+    """Whether a value is an integer by its kind: no interval, and no fraction either."""
+    return total == 0.0 and value.is_integer()
 
 
 def total_interval(std: float, systematic: float, coverage_factor: float = 1.96) -> float:

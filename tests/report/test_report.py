@@ -9,7 +9,7 @@ import re
 
 import pytest
 
-from pmsmtool.report.report import Change, Figure, _intervals, render, total_interval
+from pmsmtool.report.report import INTEGER, Change, Figure, _estimate_row, _intervals, render, total_interval
 from pmsmtool.report.verdict import COMPLETE, NEEDED
 
 
@@ -165,3 +165,12 @@ def test_two_intervals_are_drawn_and_said_to_overlap_or_not(measured: float, mee
     row = {"measured": measured, "interval": 0.1, "low": 0.9, "high": 1.1}
     assert ('aria-label="the intervals overlap"' in _intervals(row)) == meet
     assert _intervals({**row, "low": None}) == "" == _intervals({**row, "measured": None})
+
+
+def test_only_an_integer_without_an_interval_is_called_one() -> None:
+    exact = {"name": "x", "std": 0.0, "systematic": 0.0}
+    assert [cell[0] for cell in _estimate_row({**exact, "value": 3.0, "unit": "1"})][1:3] == ["3", INTEGER]
+    assert [cell[0] for cell in _estimate_row({**exact, "value": 0.35, "unit": "ohm"})][1:3] == [
+        "0.35 ohm (exact)",
+        "0 ohm",
+    ]
