@@ -16,6 +16,7 @@ motor alone takes the torque. So a trapezoid, whose acceleration steps, may be f
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 from typing import Literal
@@ -185,10 +186,7 @@ Rational = tuple[Array, Array]
 
 
 def _times(*parts: Rational) -> Rational:
-    num, den = np.ones(1), np.ones(1)
-    for a, b in parts:
-        num, den = np.convolve(num, a), np.convolve(den, b)
-    return num, den
+    return functools.reduce(lambda one, other: (np.convolve(one[0], other[0]), np.convolve(one[1], other[1])), parts)
 
 
 def _plus(first: Rational, second: Rational) -> Rational:
@@ -217,6 +215,7 @@ def speed_from_angle(path: AxisPath) -> Rational:
     return _times((np.array([1.0, -1.0]) / path.T, np.array([1.0, 0.0])), _filter(path.filter_hz, path.T))
 
 
+@functools.lru_cache(maxsize=64)
 def controllers(path: AxisPath, gains: AxisGains, loop: Loop) -> tuple[Rational, Rational]:
     """Return what the angle and what the speed seen is multiplied with: torque = -(first theta + second omega).
 

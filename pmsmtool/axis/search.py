@@ -317,8 +317,8 @@ def axis_margins(plant: Lifted, path: AxisPath, gains: AxisGains, loop: Loop) ->
     up, down = factors[factors > 1.0], factors[(factors > 0.0) & (factors < 1.0)]
     lags = np.mod(phases, 2.0 * math.pi)
     distance = -_largest(lambda w: -np.abs(1.0 + at(w)), omega, -np.abs(1.0 + values))
-    following = _largest(lambda w: np.abs(at(w) / (1.0 + at(w))), omega, np.abs(values / (1.0 + values)))
     closed = np.abs(values / (1.0 + values))
+    following = _largest(lambda w: np.abs((found := at(w)) / (1.0 + found)), omega, closed)
     below = np.flatnonzero(closed < math.sqrt(0.5))
     found = LoopMargins(
         stable=bool(np.all(np.abs(poles) < 1.0)),
