@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ from pmsmtool.bus.connect import Connection
 from pmsmtool.drive.canopen_drive import CanopenDrive
 from pmsmtool.drive.drive_node import is_safe
 from pmsmtool.drive.parameters import DriveParameters
-from pmsmtool.experiments import standstill
+from pmsmtool.estimators.flux import map_fit
+from pmsmtool.experiments import flux_map_scan, standstill
 from pmsmtool.files import data_folder
 from pmsmtool.machine.machine_file import dump_machine_file, load_machine_file
 from pmsmtool.run_directory import RunDirectory
@@ -232,8 +234,16 @@ def test_pole_pairs_are_an_integer_by_the_counts_that_the_drive_states(tool: Too
 
 
 @pytest.mark.chain
-def test_the_map_of_a_locked_shaft_names_what_it_takes_from_the_drive_once(tool: Tool) -> None:
-    """Its machine file had the offset 0 where the drive holds 0.35 rad: `tune` and `flash` would have written that."""
+def test_the_map_of_a_locked_shaft_names_what_it_takes_from_the_drive_once(
+    tool: Tool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its machine file had the offset 0 where the drive holds 0.35 rad: `tune` and `flash` would have written that.
+
+    Half of the pulse trains and the coarsest spline: all of them are in ``tests/measurement/test_flux_map.py``.
+    """
+    trains = partial(flux_map_scan.ScanPlan, rectangles=flux_map_scan.RECTANGLES[:5])
+    monkeypatch.setattr(flux_map_scan, "ScanPlan", trains)
+    monkeypatch.setattr(map_fit, "PIECES", map_fit.PIECES[:1])
     bus = ("-i", "pmsmsim", "-c", profile("interior-2k2", rotor="locked", theta_M_start_rad=1.0), "--yes")
     stored = ("motor.pole_pairs=3", "encoder.offset_rad=0.35", "motor.psi_f_wb=0.545", "--store")
     assert tool("param", "set", *stored, *bus)[0] == 0
