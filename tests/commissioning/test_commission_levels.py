@@ -65,6 +65,9 @@ SLOW = "&bitrate=125000"
 """A quarter of the readings of a torque pulse at 1 Mbit/s, for a chain whose test is not of their number."""
 SLOWLY = IdentifyRequest(speed_max_rad_s=40.0)
 """Torque pulses of a quarter of their length, and no run-up to the voltage: where the pulses decide nothing."""
+ASKED = IdentifyRequest()
+UNTIL_KNOWN = IdentifyRequest(accuracy=0.01)
+"""On the inject level every mean is read out as a record: no more of them than the values need."""
 FILLED_IN = (0x1234, 0x5678)
 """Vendor and product a person writes into a map whose maker's numbers are in no source."""
 
@@ -86,11 +89,12 @@ def opened(options: str, given: DriveMap | None = None) -> Iterator[tuple[Canope
 
 
 def chain(
-    run: RunDirectory, drive: CanopenDrive, found: Capabilities, *, sheet: bool = True, proof: ProofRequest = FEW
-) -> tuple[Quiet, Told]:
+    run: RunDirectory, drive: CanopenDrive, found: Capabilities, *, sheet: bool = True, proof: ProofRequest = FEW,
+    asked: IdentifyRequest = ASKED,
+) -> tuple[Quiet, Told]:  # fmt: skip
     progress, person = Quiet(), Told()
     nameplate = load_machine_file(PROFILE) if sheet else None
-    Commissioning(run, drive, person, progress, nameplate, prove=proof, capabilities=found).carry_out()
+    Commissioning(run, drive, person, progress, nameplate, asked, prove=proof, capabilities=found).carry_out()
     assert is_safe(drive.node.state())
     return progress, person
 
@@ -305,7 +309,8 @@ def test_recorder_level_is_flashed_whole_and_proven_by_a_speed_step(tmp_path: Pa
 def test_inject_level_is_commissioned_whole_and_replayed(tmp_path: Path) -> None:
     with opened("&level=inject") as (drive, found):
         run = begin_run(drive, tmp_path, level=found.level)
-        progress, _ = chain(run, drive, found, sheet=False, proof=replace(FEW, experiments=("q_steps",)))
+        proof = replace(FEW, experiments=("q_steps",))
+        progress, _ = chain(run, drive, found, sheet=False, proof=proof, asked=UNTIL_KNOWN)
     assert len(progress.ended) == 7 and set(progress.ended.values()) == {"pass"}
     stage = run.read().stage("identify")
     assert stage is not None and any("means are made from records" in line for line in stage.fallbacks)
