@@ -180,7 +180,7 @@ def test_a_profile_of_unknown_unit_is_found_by_the_demand(tool: Tool, tmp_path: 
     profile = ((0x6081, 0, "U32", "rw", "7"), (0x6083, 0, "U32", "rw", ramp), (0x6084, 0, "U32", down, ramp))
     eds = write_eds(tmp_path / "unit.eds", unknown("0x2D", *POSITION, *profile))
     identify = ("--identify", "interior-2k2") if down == "rw" else ()
-    channel = ("--sim", f"interior-2k2?eds={eds}&nv={tmp_path / 'unit.nv'}")
+    channel = ("--sim", f"interior-2k2?eds={eds}&nv={tmp_path / 'unit.nv'}&bitrate=500000")
     asked = ("--by", "90deg", "--speed", "120rpm", "--acceleration", "120", "--yes", "--json", "--settle", "0.2s")
     code, printed, said = tool("move", *asked, *channel, *identify)
     assert code == 0, said
@@ -355,7 +355,8 @@ def test_cogging_over_a_part_of_a_turn(tool: Tool, tmp_path: Path) -> None:
     torque_nm = 0.45  # 3 % of the rated one
     cogs = replace(known, simulation={**known.simulation, "cogging_nm": torque_nm, "cogging_periods": 12})
     (tmp_path / "cogs.toml").write_text(dump_machine_file(cogs), encoding="utf-8")
-    sim = ("--map", "ingenia", "--sim", f"{tmp_path / 'cogs.toml'}?drive=ingenia&nv={tmp_path / 'axis.nv'}", "--yes")
+    channel = f"{tmp_path / 'cogs.toml'}?drive=ingenia&nv={tmp_path / 'axis.nv'}&bitrate=250000"
+    sim = ("--map", "ingenia", "--sim", channel, "--yes")
     code, printed, said = tool("move", "--by", "180deg", "--cogging", "interior-2k2", *sim, "--json", "-o", "kept.toml")
     assert code == 0, said
     assert "travel    198 deg" in said and "warning: partial: over 0." in said
