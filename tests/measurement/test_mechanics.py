@@ -107,6 +107,7 @@ def test_the_inertia_is_right_where_i_d_does_not_stay_zero(tmp_path: Path, monke
         assert 1.0 / PREDICTED_FACTOR < ratio < (PREDICTED_FACTOR if key == "J_kgm2" else DRAG_FACTOR), key
 
 
+@pytest.mark.filterwarnings("error")  # of three samples no cubic was left, and a warning printed
 def test_a_shaft_that_friction_stops_while_its_push_is_read_out_coasts_within_the_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
