@@ -372,7 +372,7 @@ def _harmonic_current(trace: Trace, direction: int, pole_pairs: int, result: Eva
     taken = np.zeros(len(trace))
     for rows in np.array_split(np.arange(len(trace)), HARMONIC_PARTS)[1:]:
         speed = float(np.mean(omega[rows]))
-        if abs(speed) <= slowest or len(rows) <= HARMONIC_DEGREE + 1:  # also where it stood
+        if abs(speed) <= slowest or len(rows) <= HARMONIC_DEGREE + 1:  # it stood, or a fit leaves nothing
             continue
         for i, error, K_p in zip(currents, errors, trace.meta.get("K_p_v_per_a", ()), strict=False):
             i_left, error_left = _quick_part(i[rows]), _quick_part(error[rows])
