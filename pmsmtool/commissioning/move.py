@@ -22,7 +22,7 @@ from pmsmtool.drive.guard import guarded
 from pmsmtool.drive.motion_objects import first_of_axes, held_current_limits, low_limits
 from pmsmtool.drive.position_drive import PositionDrive
 from pmsmtool.drive_maps.drive_map import DriveMap
-from pmsmtool.errors import ConfigError
+from pmsmtool.errors import ConfigError, Contradiction
 from pmsmtool.experiments.move import MoveProfile, record_move
 from pmsmtool.identification.cogging import PARTIAL, Cogging, save_cogging
 from pmsmtool.identification.completed_machine import PER_PSI, completed_machine
@@ -333,6 +333,8 @@ CURRENT_SHARE = 0.01
 """Gain of a drive's current sensors may be off by this (95 %), as `identify` takes it."""
 PEAK = math.sqrt(0.5)
 """Torque of amperes that are peak, of that of rms ones."""
+HEAVIER = 0.5
+"""Inertia that the moves show beyond the file's, of it, from which on it contradicts; healthy drives: up to 0.11."""
 CLEARLY = 1.5
 """Torque that the wrong reading leaves unexplained, of the right one, from which on it is decided."""
 
@@ -352,26 +354,38 @@ def moved_cogging(
 ) -> tuple[MachineFile, dict[str, Estimate]]:
     """Find cogging over the way of slow moves, keep machine file and table in the run, and return it with what it is.
 
-    Raises ConfigError: a machine file without the inertia; IdentificationError: the moves do not show it.
+    Raises ConfigError: a machine file without the inertia; IdentificationError: the moves do not show it;
+    Contradiction: the current speeds up more than that inertia.
     """
     machine, J_kgm2 = source.machine, inertia_of(source)
     share = math.hypot(flux_doubt(source), CURRENT_SHARE)
+    J_share = stated_share("J_kgm2", source)[0]
 
     def read_as(scale: float, more: float = 0.0) -> Cogging:
         return partial_cogging(
             trace, pole_pairs=machine.pole_pairs, psi_wb=scale * machine.psi_f_wb, J_kgm2=J_kgm2,
-            shares=(share + more, stated_share("J_kgm2", source)[0]),
+            shares=(share + more, J_share),
         )  # fmt: skip
 
     found, said = read_as(1.0), []
+    lightest = found.part
     if drive.current_undecided:
         peak = read_as(PEAK)
         rms_left, peak_left = (one.part.left_nm if one.part else 0.0 for one in (found, peak))
         if max(rms_left, peak_left) > CLEARLY * min(rms_left, peak_left):
             found, kind = (found, "rms") if rms_left < peak_left else (peak, "peak")
-            said = [f"amperes taken as {kind}, by the inertia of the machine file"]
+            said, lightest = [f"amperes taken as {kind}, by the inertia of the machine file"], found.part
         else:
             found, said = read_as(1.0, 1.0 - PEAK), ["amperes may be peak or rms: the interval is that of both"]
+            lightest = peak.part
+    if lightest and lightest.J_least_kgm2 > (1.0 + max(HEAVIER, J_share)) * J_kgm2:
+        raise Contradiction(
+            f"the torque of the moves speeds up at least {lightest.J_least_kgm2:.3g} kg m2, MACHINE has {J_kgm2:.3g}: "
+            "cogging would be as many times too large; nothing was written",
+            where=str(run.path),
+            likely="an encoder offset that was never set, a current in another unit, or a load that MACHINE leaves out",
+            hint="set up the offset there; `pmsmtool move --identify MACHINE -o FILE` finds the inertia",
+        )
     said = [str(found.part), *said]
     told = found.estimates()
     made = replace(source, estimates={**source.estimates, **told}, simulation={})

@@ -81,6 +81,8 @@ class Part:
     """Orders that may as well be a neighbour: they get no phase."""
     left_nm: float = 0.0
     """Root mean square of the torque that the orders leave (N m)."""
+    J_least_kgm2: float = 0.0
+    """Inertia that the torque of the current speeds up at least (95 %)."""
 
     def __str__(self) -> str:
         ambiguous = f"; {', '.join(map(str, self.ambiguous))} may be a neighbour" if self.ambiguous else ""

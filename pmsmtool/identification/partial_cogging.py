@@ -286,8 +286,9 @@ def partial_cogging(
     per_a = -per_a if counts_against(passes) else per_a
     fit = Regression(passes, per_a, J_kgm2, orders)
     chosen = [*besides, *fit.chosen(besides, apart)]
-    part = Part(start, way, lowest, apart, left_nm=math.sqrt(fit.left(chosen) / len(fit.torque)))
     more, half = fit.inertia(chosen)
+    left_nm = math.sqrt(fit.left(chosen) / len(fit.torque))
+    part = Part(start, way, lowest, apart, left_nm=left_nm, J_least_kgm2=J_kgm2 + more - half)
     if half < shares[1] * J_kgm2 and abs(more) < FURTHER * shares[1] * J_kgm2:  # better known than in the file
         J_kgm2 += more
         shares = shares[0], half / J_kgm2

@@ -380,3 +380,7 @@ def test_cogging_over_a_part_of_a_turn(tool: Tool, tmp_path: Path) -> None:
     (tmp_path / "lacking.toml").write_text(dump_machine_file(lacking), encoding="utf-8")
     code, _, said = tool("move", "--by", "90deg", "--cogging", str(tmp_path / "lacking.toml"), *sim)
     assert code == 2 and "cogging needs the inertia" in said
+    light = replace(known, machine=replace(known.machine, J_kgm2=known.machine.J_kgm2 / 4.0))
+    (tmp_path / "light.toml").write_text(dump_machine_file(light), encoding="utf-8")
+    code, _, said = tool("move", "--by", "180deg", "--cogging", str(tmp_path / "light.toml"), *sim, "-o", "found.toml")
+    assert code == 1 and "an encoder offset that was never set" in said and not Path("found.toml").exists(), said
