@@ -34,7 +34,7 @@ from pmsmtool.estimators.injection.axis_layout import Motion
 from pmsmtool.estimators.injection.axis_response import initial_inductance
 from pmsmtool.estimators.injection.inductance import FrameAhead, InductanceResult, bare_shot, estimate_inductances
 from pmsmtool.estimators.injection.sampling_instant import Sampling, ShownInstant
-from pmsmtool.estimators.inverter_error import InverterCurve, Modulation
+from pmsmtool.estimators.inverter_error import Modulation
 from pmsmtool.estimators.resistance import (
     R_MEASURED,
     Copper,
@@ -548,18 +548,8 @@ def inductance_of(
         U_dc_v=U_dc_v,
         tolerance=tolerance,
         further=further,
-        unseen_a=0.0 if result.flux is None else unseen_current(result.flux, result.resistance.curve),
+        unseen_a=0.0 if result.flux is None else abs(result.flux.unseen_a),
     )
-
-
-def unseen_current(flux: FluxResult, curve: InverterCurve) -> float:
-    """Return the current of the legs that no sample holds, as far as two flux linkages that disagree show one (A).
-
-    Beside the smallest d current of the coasting it turns the bridge's error, whose fundamental is 4/pi of a leg's.
-    """
-    error_v = 4.0 / math.pi * float(curve.error_v(np.array([flux.low_i_d_a]))[0])
-    apart_v = flux.apart_wb * float(np.mean(np.abs(flux.omega_rad_s)))
-    return flux.low_i_d_a * min(1.0, apart_v / error_v) if error_v > 0.0 else 0.0
 
 
 def motion_of(traces: Mapping[str, Trace], psi_wb: float, q_shots: Sequence[Trace]) -> Motion | None:

@@ -21,7 +21,7 @@ from pmsmtool.estimators.injection.inductance import InductanceResult
 from pmsmtool.estimators.resistance import at_the_test
 from pmsmtool.identification import flux_map, frequency_response
 from pmsmtool.identification.completed_machine import CompletedMachine
-from pmsmtool.identification.evaluate import NOTABLY_WIDER, Evaluation, unseen_current
+from pmsmtool.identification.evaluate import NOTABLY_WIDER, Evaluation
 from pmsmtool.identification.interval_needs import JUDGED, OFFSET, Need, interval_needs
 from pmsmtool.identification.iron_loss import LEAST, iron_loss_lines, iron_loss_of, least_ohm
 from pmsmtool.identification.verdicts import KEYS, NOT_ACCEPTED, STEP, Verdicts, verdicts_of
@@ -51,6 +51,9 @@ BEND_NOTED = 0.15
 which is said of a machine without one: a step to half of that current then meets a mean L_d 4 % off, which is what a
 predicted band leaves the loop's gain (a machine of 41 % failed its proof with a gain 11 % off, one of 28 % passed it).
 """
+UNSEEN_SHARE = 0.03
+"""Current of the legs that no sample holds, of the smallest d current of a coasting, from which on a proof draws what
+makes it: it is below 0.005 where neither iron loss nor a late sample is."""
 
 
 def acceptance_of(
@@ -227,8 +230,9 @@ def conditions_of(evaluation: Evaluation, request: IdentifyRequest) -> dict[str,
         conditions[LINK_AT_REST] = evaluation.U_dc_rest_v
     if evaluation.shown is not None:
         conditions["shown_instant_s"] = evaluation.shown.value_s
-    if evaluation.flux is not None and evaluation.flux.apart_wb and evaluation.resistance is not None:
-        conditions["unseen_current_a"] = unseen_current(evaluation.flux, evaluation.resistance.curve)
+    flux = evaluation.flux
+    if flux is not None and abs(flux.unseen_a) > UNSEEN_SHARE * flux.low_i_d_a:
+        conditions["unseen_current_a"] = abs(flux.unseen_a)
     if "frf" in request.measured:
         conditions[frequency_response.SHOWN] = frequency_response.shown_of(evaluation.frequency_response)
     if evaluation.swing_hz:

@@ -14,12 +14,10 @@ from pmsmtool.errors import IdentificationError
 from pmsmtool.estimators.cross_check import cross_check
 from pmsmtool.estimators.estimate import SensorTolerance, Verdict, statistical_half_width
 from pmsmtool.estimators.flux.linkage import (
-    DRIVEN_STD,
     MAGNET_CHANGE,
     FluxResult,
     check_magnet,
     estimate_flux_linkage,
-    with_driven,
 )
 from pmsmtool.estimators.flux.linkage_rows import fastest_pair, mean_inverter_error
 from pmsmtool.estimators.injection.inductance import InductanceResult
@@ -487,12 +485,3 @@ def test_a_magnet_may_change_by_three_times_the_scatter_of_two_windows(
     again = Trace(before.t_s[:2], rows, before.units)
     with pytest.raises(IdentificationError, match="E_MAGNET_CHANGED") if lost else nullcontext():
         check_magnet(before, again, noisy, 0.0)
-
-
-def test_a_wide_interval_takes_the_driven_windows_along() -> None:
-    """A drive whose coasting was 3.1 % off and known to 6.6 %, its driven windows 0.4 % off."""
-    coasting = Estimate(0.969, 0.066, 0.03, "Wb", method="coasting")
-    found = with_driven(coasting, Estimate(0.996, 0.0016, 0.01, "Wb", method="driven"))
-    assert found.value == pytest.approx(0.9947, abs=2e-4)
-    assert found.std == pytest.approx(DRIVEN_STD, rel=0.03)  # the mean of two is no better than the driven one's doubt
-    assert found.systematic == pytest.approx(0.011, rel=0.05)

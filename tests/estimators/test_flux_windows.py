@@ -27,10 +27,10 @@ from pmsmtool.estimators.flux import linkage
 from pmsmtool.estimators.flux.linkage import (
     D_SHARE_DOUBT,
     LEVEL_RATIO,
+    MODEL_FLOOR,
     PENALTY,
     estimate_flux_linkage,
     normalised,
-    with_driven,
 )
 from pmsmtool.estimators.flux.linkage_rows import (
     CURRENT_SETTLE_LIMIT,
@@ -245,7 +245,7 @@ def test_resistance_and_error_follow_the_currents_that_flow(sampling: Sampling |
 
 def _rows(w: Array, i_d: Array, i_q: Array, u_d: Array, u_q: Array, **parts: Array) -> Corrected:
     zero = np.zeros_like(w)
-    rest = {name: parts.get(name, zero) for name in ("acceleration_rad_s2", "ripple_q_v", "curve_q_v")}
+    rest = {name: parts.get(name, zero) for name in ("acceleration_rad_s2", "ripple_q_v", "curve_q_v", "error_d_v")}
     return Corrected(w=w, i_d=i_d, i_q=i_q, u_d=u_d, u_q=u_q, is_d=np.abs(i_q) < Q_SHARE * np.abs(i_d), **rest)
 
 
@@ -302,7 +302,7 @@ def test_levels_of_d_currents_are_a_polynomial_or_none_as_the_scatter_has_it() -
         chi.append(np.sum((weight * (y - np.polyval(c, s**2))) ** 2))
         variance.append(chi[-1] / (n - 1 - order) * covariance[-1, -1])
         curve.append(c[0] if order else 0.0)
-    noise = chi[1] / (n - 2)
+    noise = chi[1] / (n - 2) + (MODEL_FLOOR * value[0]) ** 2
     odds = math.exp(-0.5 * ((chi[0] - chi[1]) / noise - PENALTY))
     share = np.array([odds, 1.0]) / (1.0 + odds)
     assert 0.05 < share[0] < 0.95  # both count
@@ -316,6 +316,38 @@ def test_levels_of_d_currents_are_a_polynomial_or_none_as_the_scatter_has_it() -
     assert found.low_wb == pytest.approx(np.average(y[low], weights=weight[low]), rel=EXACT)
     assert found.low_std_wb == pytest.approx(np.std(y[low]) / math.sqrt(np.sum(low) - 1), rel=EXACT)
     assert found.change(bent.u_q - rough * bent.w * bent.i_d) == pytest.approx(mean, rel=EXACT)
+
+
+def _turned(rows: Corrected, unseen_a: float | Array) -> Corrected:
+    """Rows whose inverter error of 4 V is turned by a q current that no sample holds."""
+    turned = np.sign(rows.w) * 4.0 * unseen_a / np.hypot(rows.i_d, unseen_a) * rows.is_d
+    return replace(rows, u_q=rows.u_q + turned, error_d_v=4.0 * np.sign(rows.i_d))
+
+
+@pytest.mark.parametrize(("unseen_a", "bend"), [(0.25, 0.0), (0.0, -2e-3), (0.0, 0.0)])
+def test_a_current_that_no_sample_holds_is_told_from_saturation(unseen_a: float, bend: float) -> None:
+    """It turns the inverter's error, which falls with the d current; a bent axis changes with the square of it."""
+    rows, pairs = _scattered((1.5, 3.0, 4.5), np.random.default_rng(3))
+    bent = replace(rows, u_q=rows.u_q + rows.w * PSI * bend * (rows.i_d / 4.5) ** 2)
+    found = linkage._fit_even(_turned(bent, unseen_a), pairs)
+    assert found.flux_wb == pytest.approx(PSI, rel=3e-4)  # measured 1.1e-4
+    assert found.unseen_a == pytest.approx(unseen_a, abs=8e-3)  # 2.7e-3
+    assert found.curvature == pytest.approx(bend, abs=3e-4)  # 1.1e-4
+    assert found.low_wb == pytest.approx(PSI * (1.0 + bend / 9.0), rel=3e-4)  # without what it makes of it: 1.7e-4
+    if unseen_a:
+        assert found.way_wb == pytest.approx(8.5e-3 * PSI, rel=0.05), "all of it is doubted in part"
+        alone = linkage._fit_even(replace(_turned(bent, unseen_a), error_d_v=np.zeros_like(rows.w)), pairs)
+        assert alone.unseen_a == 0.0 and alone.flux_wb > 1.005 * PSI  # what the polynomial makes of it: 1.0098
+
+
+def test_driven_windows_tell_which_of_two_rough_models_counts() -> None:
+    """A current that grows with the speed fits a polynomial better than the model of one that does not."""
+    rows, pairs = _scattered((1.5, 3.0, 4.5), np.random.default_rng(3))
+    rough = _turned(rows, 0.3 * (np.abs(rows.w) / 350.0))
+    alone = linkage._fit_even(rough, pairs)
+    found = linkage._fit_even(rough, pairs, Estimate(PSI, 3e-4 * PSI, 0.0, "Wb"))
+    assert alone.flux_wb > 1.008 * PSI and alone.unseen_a == pytest.approx(0.0, abs=1e-6)  # measured 1.0093
+    assert found.flux_wb == pytest.approx(PSI, rel=1.5e-3) and found.unseen_a > 0.1  # 1.04e-3, 0.16 A
 
 
 @pytest.mark.parametrize("levels", [(4.0,), (1.5, 4.0)])
@@ -374,23 +406,20 @@ def test_the_deviation_is_made_of_what_each_cause_moves(late_s: float, driven_of
     psi = found.psi_measured.value
     rows = corrected(trace, R, T_S, CURVE, SWITCHED, lag_s, sampling)
 
-    def moved(voltage: Array) -> float:
-        """By a q voltage; the direct part of it: the median that the d axis takes from it is left where it is."""
-        return linkage._fit_even(replace(rows, u_q=rows.u_q + voltage), pairs_of(trace)).flux_wb - even.flux_wb
-
-    even = linkage._fit_even(rows, pairs_of(trace))
+    second = driven_flux_linkage(rows, linkage._rough_L_d(rows, np.nonzero(rows.is_d)[0]), 0.0, 0.0, lag_s,
+                                 replace(tolerance, bridge_threshold_v=0.0), 60.0)  # fmt: skip
+    even = linkage._fit_even(rows, pairs_of(trace), second)
+    moved = even.change  # the direct part: the models keep their shares, and the median of the d axis stays
     step = 1e-3 * T_S
     later, sooner = (
-        linkage._fit_even(
-            corrected(trace, R, T_S, CURVE, SWITCHED, lag_s, replace(sampling, instant_s=t)), pairs_of(trace)
-        )
+        corrected(trace, R, T_S, CURVE, SWITCHED, lag_s, replace(sampling, instant_s=t)).u_q
         for t in (sampling.instant_s + step, sampling.instant_s - step)
     )
-    per_instant = (later.flux_wb - sooner.flux_wb) / (2.0 * step)
+    per_instant = moved(later - sooner) / (2.0 * step)
     assert found.shown is not None and abs(per_instant) > 1.0
     model = [
         linkage.RIPPLE_DOUBT * moved(rows.ripple_q_v), linkage.CURVE_DOUBT * moved(rows.curve_q_v),
-        linkage.CURVATURE_DOUBT * (even.low_wb - even.flux_wb),
+        linkage.CURVATURE_DOUBT * even.way_wb,
         linkage.LAG_STD * lag_s * moved(psi * rows.acceleration_rad_s2),
         per_instant * math.hypot(found.shown.std_s, apart_s), linkage.RELATIVE_FLOOR * psi, 0.001 * psi,
     ]  # fmt: skip
@@ -421,21 +450,6 @@ def test_the_deviation_is_made_of_what_each_cause_moves(late_s: float, driven_of
     q = ~rows.is_d
     assert found.L_q_app.i_q_apk == pytest.approx(3.0) and found.L_q_app.n == np.sum(q) == 4
     assert found.L_q_app.systematic == pytest.approx(math.hypot(0.01, 0.01) * abs(d_fit[0]), rel=EXACT)
-
-
-def test_windows_that_scatter_by_a_percent_take_the_driven_ones_along() -> None:
-    trace = _windows()
-    for scatter_v, wide in ((4.0, True), (1.0, False)):
-        noise = scatter_v * np.random.default_rng(9).standard_normal(len(trace)) * (np.abs(trace["i_d_a"]) > 1.0)
-        noisy = _changed(trace, u_q_v=trace["u_q_v"] + noise)
-        found = estimate_flux_linkage(noisy, R, period_s=T_S, T_ref_c=60.0)
-        rows = corrected(noisy, R, T_S, None, None, 0.0)
-        alone = linkage._fit_even(rows, pairs_of(noisy))
-        assert found.driven is not None and found.apart_wb == 0.0 and (alone.std_wb > 0.01 * PSI) is wide
-        psi = math.hypot(alone.flux_wb, linkage._fit_d(rows)[0][1])
-        expected = with_driven(Estimate(psi, alone.std_wb, 0.0, "Wb"), found.driven).value if wide else psi
-        assert found.psi_f.value == pytest.approx(expected, rel=1e-4)
-        assert ("with driven" in found.psi_f.method) is wide
 
 
 def test_the_frame_is_known_as_well_as_both_parts_of_the_flux_linkage() -> None:
@@ -486,15 +500,7 @@ def test_flux_linkages_move_to_the_reference_temperature_with_the_doubt_of_both(
     assert (unknown.value, unknown.std, unknown.systematic) == (0.3, 0.003, 0.004) and unknown.fallback
 
 
-def test_two_flux_linkages_are_weighted_by_their_variances() -> None:
-    coasting, driven = Estimate(0.30, 0.010, 0.02, "Wb", method="a"), Estimate(0.33, 0.004, 0.05, "Wb", method="b")
-    other = 0.004**2 + (linkage.DRIVEN_STD * 0.33) ** 2
-    found = with_driven(coasting, driven)
-    weights = np.array([1.0 / 0.010**2, 1.0 / other])
-    assert found.value == pytest.approx(np.average([0.30, 0.33], weights=weights), rel=EXACT)
-    assert found.std == pytest.approx(np.sum(weights) ** -0.5, rel=EXACT)
-    assert found.systematic == pytest.approx(np.average([0.02, 0.05], weights=weights), rel=EXACT)
-    assert found.dof == math.inf and found.method == "a, with b"
+# ---- the second method ------------------------------------------------------------------------------------------
 
 
 # ---- the second method ------------------------------------------------------------------------------------------

@@ -9,10 +9,10 @@ so u = (v* - v_err - R i) (w T_s/2)/sin(w T_s/2) is j w psi: the correction DIVI
 i_q = 0, where the inverter's error has no q part but the one of the ripple (:mod:`inverter_error`), and i_d is held
 with both signs one after the other: their sum cancels the flux of i_d and what the ripple of the currents does,
 
-    (u_q+ + u_q-)/(w+ + w-) = x1 (1 + k2 i_d^2 + k4 i_d^4),      u_d = -L_q w i_q + x2 w - psi w^2 dt + ...,
+    (u_q+ + u_q-)/(w+ + w-) = x1 (1 + k2 i_d^2 + k4 i_d^4) + i_u e(i_d)/(|w i_d|),   u_d = -L_q w i_q + x2 w + ...,
 
-psi = hypot(x1, x2), frame ahead of the d axis by eps = atan2(x2, x1), k2 and k4 the saturation of the d axis, and dt
-what is left of angle and voltage delay.
+psi = hypot(x1, x2), frame ahead of the d axis by eps = atan2(x2, x1), k2 and k4 the saturation of the d axis, and i_u a
+q current of the legs that no sample holds, as iron loss draws it within the pulses: it turns the inverter's error e.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
-from pmsmtool.estimators.cross_check import cross_check, driven_flux_linkage
+from pmsmtool.estimators.cross_check import SATURATION_DOUBT, cross_check, driven_flux_linkage
 from pmsmtool.estimators.estimate import SensorTolerance, condition_gate, information_weights
 from pmsmtool.estimators.flux.linkage_rows import (
     STAGE,
@@ -63,6 +63,8 @@ LAG_STD = 0.03
 D_SHARE_DOUBT = 0.07
 """Standard deviation of the d part of the inverter's error at a q current, of its q part (measured on 11 drives: 0.01
 to 0.13, rms 0.068, always of the sign that makes L_q too large)."""
+MODEL_FLOOR = 3e-4
+"""Relative standard deviation of a window's flux linkage by what no model of them has: less decides between none."""
 PENALTY = 7.0
 """Price of a parameter in the information criterion, as for L (``axis_fit``): with ln n, 2.8 for 16 pairs, a curvature
 that is not there made psi_f scatter by three times its bound."""
@@ -70,11 +72,6 @@ INSTANT_STEP = 0.01
 """Step of the derivative by the sampling instant (T_s)."""
 MAGNET_CHANGE = 0.003
 """Change of the flux linkage over the pulses of a flux map that counts as none, whatever the scatter."""
-WIDE = 0.01
-"""Standard deviation of the coasting's flux linkage, relative, from which on that of the driven windows counts, too.
-Iron loss beside eddy currents, lag and late samples left 6.6 % of it and 3.1 % of error, where these were 0.4 % off."""
-DRIVEN_STD = 0.015
-"""Standard deviation of the driven windows beside their scatter, relative: 0.4 and 2.9 % were seen."""
 PAIR_SCATTERS = 3.0
 """Scatter of a pair of windows, of which two may be apart."""
 LEVEL_RATIO = 1.2
@@ -92,7 +89,7 @@ class FluxResult:
     frame_offset: Estimate
     """Angle of the frame ahead of the d axis (rad electrical): add it to the stored encoder offset."""
     driven: Estimate | None
-    """PM flux linkage at the reference temperature by the run's q currents, a check only (Wb); None without them."""
+    """PM flux linkage at the reference temperature by the run's q currents, a check (Wb); None without them."""
     voltage_scale_std: float
     """Relative standard deviation that both have from the bridge's thresholds."""
     L_q_app: Estimate
@@ -113,6 +110,8 @@ class FluxResult:
     apart_wb: float = 0.0
     """How far the flux linkage by driving currents lies from this one, where beyond what both say of themselves: then
     an effect that neither knows, iron loss above all, is in them, and it is a standard deviation here. Else 0 (Wb)."""
+    unseen_a: float = 0.0
+    """q current of the legs that no sample holds, with the sign of the speed (A)."""
 
 
 def estimate_flux_linkage(
@@ -165,7 +164,9 @@ def estimate_flux_linkage(
     check_speeds(speeds, pairs, whole)
     rows = corrected(speeds, R_ohm, period_s, inverter, modulation, lag_s, sampling)
     d_fit, d_std, d_dof = _fit_d(rows)
-    even = _fit_even(rows, pairs)
+    T, rough_L_d = float(np.mean(speeds["T_magnet_c"])), _rough_L_d(rows, rows.is_d)
+    alike = replace(tolerance, bridge_threshold_v=0.0)  # both methods have the scale of the voltage
+    even = _fit_even(rows, pairs, driven_flux_linkage(rows, rough_L_d, 0.0, 0.0, lag_s, alike, T))
     x1, x2 = even.flux_wb, float(d_fit[1])
     psi = math.hypot(x1, x2)
     eps = math.atan2(x2, x1)
@@ -189,7 +190,7 @@ def estimate_flux_linkage(
     model_std = math.hypot(
         RIPPLE_DOUBT * even.change(rows.ripple_q_v),
         CURVE_DOUBT * even.change(rows.curve_q_v),
-        CURVATURE_DOUBT * (even.low_wb - even.flux_wb),
+        CURVATURE_DOUBT * even.way_wb,
         even.curvature * even.q_share**2 * psi,
         LAG_STD * lag_s * even.change(psi * rows.acceleration_rad_s2),
         0.0 if shown is None else per_instant * math.hypot(shown.std_s, apart_s),
@@ -198,8 +199,7 @@ def estimate_flux_linkage(
     )
     fitted = math.hypot(math.cos(eps) * even.std_wb, math.sin(eps) * d_std[1])
     std = math.hypot(fitted, model_std)
-    T = float(np.mean(speeds["T_magnet_c"]))
-    driven = driven_flux_linkage(rows, _rough_L_d(rows, rows.is_d), x2, even.curvature, lag_s, tolerance, T)
+    driven = driven_flux_linkage(rows, rough_L_d, x2, even.curvature, lag_s, tolerance, T)
     apart = 0.0
     if driven is not None:
         alone = Estimate(psi, std, 0.0, "Wb")
@@ -222,8 +222,6 @@ def estimate_flux_linkage(
         fallback=left_out,
         dof=even.dof * (std / fitted) ** 4 if fitted > 0.0 else math.inf,  # Welch-Satterthwaite, GUM G.4
     )
-    if driven is not None and not apart and std > WIDE * psi:
-        measured = with_driven(measured, driven)
     offset = Estimate(
         value=eps,
         std=math.hypot(math.cos(eps) * d_std[1] / psi, math.sin(eps) * even.std_wb / psi, OFFSET_FLOOR_RAD),
@@ -259,20 +257,7 @@ def estimate_flux_linkage(
         residual_wb=even.residual_wb,
         shown=shown,
         apart_wb=apart,
-    )
-
-
-def with_driven(coasting: Estimate, driven: Estimate) -> Estimate:
-    """Return the mean of both, weighted by what they are known to, with the check's own doubt beside its scatter."""
-    other = math.hypot(driven.std, DRIVEN_STD * driven.value)
-    share = coasting.std**2 / (coasting.std**2 + other**2)
-    return replace(
-        coasting,
-        value=coasting.value + share * (driven.value - coasting.value),
-        std=math.sqrt(share) * other,
-        systematic=(1.0 - share) * coasting.systematic + share * driven.systematic,
-        method=f"{coasting.method}, with {driven.method}",
-        dof=math.inf,
+        unseen_a=even.unseen_a,
     )
 
 
@@ -337,7 +322,8 @@ def _fit_d(rows: Corrected) -> tuple[Array, Array, int]:
 class _Even:
     """Fit of the flux that does not depend on the sign of i_d; ``row`` maps the q voltages of all rows onto it.
 
-    ``q_share`` is the largest q current beside a d current, over the largest of those: the shaft was driven.
+    ``q_share`` is the largest q current beside a d current, over the largest of those: the shaft was driven. ``way_wb``
+    is how far the flux linkage at the smallest d current, as it is shown, lies from the one without any.
     """
 
     flux_wb: float
@@ -351,16 +337,19 @@ class _Even:
     w: Array
     residual_wb: Array
     row: Array
+    way_wb: float
+    unseen_a: float
 
     def change(self, voltage_v: Array) -> float:
         """Change of the flux that a q voltage of every row makes (Wb)."""
         return float(self.row @ voltage_v)
 
 
-def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
-    """Average the model without curvature and the one with as many terms as there are levels, as the data support them.
+def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]], driven: Estimate | None = None) -> _Even:
+    """Average three models: flux linkage alone, with a current that no sample holds, with as many terms as levels.
 
-    A machine that saturates has all of them.
+    Weighted as the data support them, and the flux linkage of ``driven`` windows, which neither effect moves much: iron
+    loss makes the second, a machine that saturates has all levels.
     """
     w, i_d = rows.w, rows.i_d
     first, second = (np.array([pair[k] for pair in pairs]) for k in (0, 1))
@@ -370,6 +359,7 @@ def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
     index = np.arange(len(pairs))
     reduce[index, first] = reduce[index, second] = 1.0 / w_sum
     y = reduce @ (rows.u_q - _rough_L_d(rows, np.concatenate([first, second])) * w * i_d)
+    turned = reduce @ (np.sign(w) * rows.error_d_v * i_d / np.maximum(i_d**2 + rows.i_q**2, np.finfo(float).tiny))
     level = 0.5 * np.abs(i_d[first] - i_d[second])
     s = level / np.max(level)
     weight = np.abs(w_sum) * s  # an error voltage that falls with the current
@@ -378,28 +368,35 @@ def _fit_even(rows: Corrected, pairs: Sequence[tuple[int, int]]) -> _Even:
     levels = 1 + int(np.sum(sizes[1:] > LEVEL_RATIO * sizes[:-1]))
     n = len(y)
     hats, residuals = [], []
-    orders = sorted({0, levels - 1})
-    for order in orders:
-        matrix = np.stack([s ** (2 * k) for k in range(order + 1)], axis=1)
+    models = sorted({(0, 0), (0, int(np.any(turned))), (levels - 1, 0)})
+    for order, unseen in models:
+        matrix = np.stack([*(s ** (2 * k) for k in range(order + 1)), *[turned] * unseen], axis=1)
         hats.append(np.linalg.pinv(matrix * weight[:, None]) * weight)
         residuals.append(y - matrix @ (hats[-1] @ y))
     chi = np.array([float(np.sum((weight * residual) ** 2)) for residual in residuals])
-    dof = n - 1.0 - np.array(orders)
-    variance = max(float(chi[-1] / dof[-1]), (np.finfo(np.float64).eps * float(np.max(np.abs(y)))) ** 2)
-    share = information_weights([float(c / variance + PENALTY * (n - d)) for c, d in zip(chi, dof, strict=True)])
+    dof = n - 1.0 - np.sum(models, axis=1)
     values = np.array([float(hat[0] @ y) for hat in hats])
+    bends = np.array([float(np.sum((hat @ y)[1 : order + 1])) for hat, (order, _) in zip(hats, models, strict=True)])
+    unseen_a = np.array([unseen * float(hat[-1] @ y) for hat, (_, unseen) in zip(hats, models, strict=True)])
+    floor = MODEL_FLOOR * values[0]
+    price = chi / (float(np.min(chi / dof)) + floor**2) + PENALTY * (n - dof) + (unseen_a / sizes[0]) ** 2
+    if driven is not None:
+        price += (values - driven.value) ** 2 / (driven.std**2 + floor**2 + (SATURATION_DOUBT * bends) ** 2)
+    share = information_weights(list(price))
     value = float(share @ values)
     within = chi / dof * np.array([float(np.sum((hat[0] / weight) ** 2)) for hat in hats])
-    low = level < LEVEL_RATIO * sizes[0]
+    low, at_low = level < LEVEL_RATIO * sizes[0], y - float(share @ unseen_a) * turned
     return _Even(flux_wb=value, std_wb=math.sqrt(float(share @ (within + (values - value) ** 2))),
                  dof=float(share @ dof),
-                 curvature=sum(float(p * np.sum((hat @ y)[1:])) for p, hat in zip(share, hats, strict=True)) / value,
+                 curvature=float(share @ bends) / value,
                  q_share=float(np.max(np.abs(rows.i_q[np.concatenate([first, second])])) / np.max(level)),
-                 low_wb=float(np.average(y[low], weights=weight[low])),
-                 low_std_wb=float(np.std(y[low])) / math.sqrt(max(1, int(np.sum(low)) - 1)),
+                 low_wb=float(np.average(at_low[low], weights=weight[low])),
+                 low_std_wb=float(np.std(at_low[low])) / math.sqrt(max(1, int(np.sum(low)) - 1)),
                  low_i_d_a=float(np.mean(level[low])), w=0.5 * w_sum,
                  residual_wb=np.asarray(share @ np.stack(residuals)),
-                 row=np.asarray(share @ np.stack([hat[0] for hat in hats]) @ reduce))  # fmt: skip
+                 row=np.asarray(share @ np.stack([hat[0] for hat in hats]) @ reduce),
+                 way_wb=float(np.average(y[low], weights=weight[low])) - value,
+                 unseen_a=float(share @ unseen_a))  # fmt: skip
 
 
 def _rough_L_d(rows: Corrected, which: NDArray[np.int64 | np.bool_]) -> float:

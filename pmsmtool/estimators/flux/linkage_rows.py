@@ -54,6 +54,8 @@ class Corrected:
     ripple_q_v: Array
     curve_q_v: Array
     """q parts of the error that was taken off: of the ripple, and of the sampled current (V). Shape (n,)."""
+    error_d_v: Array
+    """Its d part (V). Shape (n,)."""
     is_d: NDArray[np.bool_]
     """Rows with a d current. Shape (n,)."""
 
@@ -133,6 +135,7 @@ def corrected(
         u_q=(voltage[1] - rippled[1] - R_ohm * mean[1]) * correction + w * course_wb,
         ripple_q_v=rippled[1] - shifted[1],
         curve_q_v=plain[1],
+        error_d_v=rippled[0],
         is_d=np.abs(i_q) < Q_SHARE * np.abs(i_d),
     )
 
