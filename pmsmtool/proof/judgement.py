@@ -101,8 +101,8 @@ one leaves (measured on the spoiled drives of the tests: 0.32 and 0.37; on a sat
 RIPPLE_MOST = 1.0
 """Most ripple that counts, of the half width without: what shakes more than it may be off is not healthy."""
 SHAKES = (
-    "the machine shakes in steady state by more than the band: an encoder off centre behind a stiff speed loop, an "
-    "elastic shaft, cogging, or a link with ripple"
+    "the machine shakes in steady state by more than the band: an encoder off centre behind a stiff speed loop, a "
+    "shaft that is elastic or has play, cogging, or a link with ripple"
 )
 SPEED_STEP = ("speed_step", "i_q_a")
 OSCILLATES = (
