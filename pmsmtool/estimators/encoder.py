@@ -127,7 +127,7 @@ def estimate_encoder(forward: Trace, backward: Trace, limit_rad: float = LINEARI
         if turns < MINIMUM_TURNS:
             raise refuse("E_EXCITATION", f"the rotor turned {turns:.2f} times, {MINIMUM_TURNS:g} needed", stage=STAGE)
         deviation = direction * count * trace["theta_M_rad"] - trace["theta_imposed_rad"]
-        centre = _circular_mean(deviation)
+        centre = float(np.angle(np.mean(np.exp(1j * deviation))))
         worst = float(np.max(np.abs(wrapped(deviation - centre))))
         if worst > limit_rad:
             raise refuse(
@@ -140,22 +140,11 @@ def estimate_encoder(forward: Trace, backward: Trace, limit_rad: float = LINEARI
             )
         offsets.append((centre, float(np.std(wrapped(deviation - centre)))))
     lag = 0.5 * float(wrapped(np.array([offsets[0][0] - offsets[1][0]]))[0])
-    offset = float(wrapped(np.array([offsets[1][0] + lag]))[0])
-    scatter = math.hypot(offsets[0][1], offsets[1][1]) / 2.0
-    return EncoderResult(
-        pole_pairs=Estimate(float(count), distance, 0.0, "1", n=len(forward) + len(backward), method="slow rotation"),
-        direction=direction,
-        offset=Estimate(
-            offset,
-            math.hypot(scatter, 0.25 * abs(lag)),
-            0.0,
-            "rad",
-            n=len(forward) + len(backward),
-            method="slow rotation, mean of both directions (coarse)",
-        ),
-        lag_rad=lag,
-        per_turn=_per_turn(forward, backward, direction, count),
-    )
+    middle, rows = float(wrapped(np.array([offsets[1][0] + lag]))[0]), len(forward) + len(backward)
+    std = math.hypot(0.5 * math.hypot(offsets[0][1], offsets[1][1]), 0.25 * abs(lag))
+    pole_pairs = Estimate(float(count), distance, 0.0, "1", n=rows, method="slow rotation")
+    offset = Estimate(middle, std, 0.0, "rad", n=rows, method="slow rotation, mean of both directions (coarse)")
+    return EncoderResult(pole_pairs, direction, offset, lag, _per_turn(forward, backward, direction, count))
 
 
 def estimate_by_rests(levels: Trace, pairs: Trace) -> EncoderResult:
@@ -254,7 +243,3 @@ def _slope(trace: Trace) -> float:
 def wrapped(angle: Array) -> Array:
     """Return angles (rad) within half a turn of zero."""
     return np.asarray(np.angle(np.exp(1j * angle)))
-
-
-def _circular_mean(angle: Array) -> float:
-    return math.atan2(float(np.mean(np.sin(angle))), float(np.mean(np.cos(angle))))

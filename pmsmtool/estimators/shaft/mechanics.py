@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from pmsmtool.arrays import Array
 from pmsmtool.errors import IdentificationError
-from pmsmtool.estimators.angle_harmonics import LEAST_SPEED, AngleHarmonics, Harmonic, angle_harmonics
+from pmsmtool.estimators.angle_harmonics import DEGREE, LEAST_SPEED, SURE, AngleHarmonics, Harmonic, angle_harmonics
 from pmsmtool.estimators.estimate import (
     COVERAGE_FACTOR,
     SensorTolerance,
@@ -281,7 +281,22 @@ def estimate_mechanics(
     )  # fmt: skip
     ripple, unexplained = max(torque_noise(noisy).values()), _unexplained(blocks, noisy)
     orders = blocks[0].disturbances.orders
+    harmonics = _with_encoder(harmonics, prior, without.x[: -2 * len(runs)], widen * np.sqrt(np.diag(covariance)))
     return MechanicsResult(J_found, B_found, tau_found, stds, ripple, chi2, unexplained, harmonics, drag, orders)
+
+
+def _with_encoder(harmonics: AngleHarmonics, prior: Sequence[Harmonic], x: Array, std: Array) -> AngleHarmonics:
+    """Return harmonics with what all traces show of the encoder's error where the turns of a coasting are too few.
+
+    ``x`` ends with the sizes of the error's waves about the ``prior``. Friction over the angle is fitted beside it.
+    """
+    found = list(harmonics.encoder_rad)
+    shown, stds = (of[SHAFT : len(x)][-2 * len(prior) :].reshape(-1, 2).tolist() for of in (x, std))
+    for h, (cosine, sine), pair in zip(prior, shown, stds, strict=False):  # a fit without shapes has none
+        seen = Harmonic(h.order, h.cosine + h.std * cosine, h.sine + h.std * sine, h.std * max(pair))
+        if h.order * harmonics.turns < DEGREE and seen.amplitude > SURE * seen.std:
+            found.append(seen)
+    return replace(harmonics, encoder_rad=tuple(found))
 
 
 def mean_mechanics(
