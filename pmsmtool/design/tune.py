@@ -8,6 +8,7 @@ on its way pays for what is imported here.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -59,6 +60,8 @@ PREDICTED_TURN = 0.1
 """rad that the rotor turns in a period at base speed. Beyond it decoupling by the sampled current comes so late that
 steps of drawn machines left 1.05 I_max, 1.10 at most, and 1.02 with the predictor (docs/control.md, section 7).
 """
+EDDY_NOTED = 0.01
+"""Part of L that eddy currents hide from the current loops, from which on it is told: what L is known to."""
 _CURRENT_OPTIONS = 0b111
 _PREDICTOR_OPTION = 1 << 4
 
@@ -101,7 +104,7 @@ def tune(source: MachineFile | str | Path, request: TuneRequest | None = None) -
     gains = {axis: choice.gains(axis) for axis in "dq"}
     governor = design_governor(source, rated, gains, request.governor, predictor=predictor, eps=request.eps)
     parts = [
-        _design_current(choice),
+        _design_current(source, choice),
         _design_speed(source, request, rated, choice, weakening.ramp_limit_rpm_per_s),
         _Part(dict(governor.values), {}, dict(governor.facts), governor.notes),
         _Part(
@@ -153,7 +156,7 @@ class _Part:
     notes: tuple[str, ...]
 
 
-def _design_current(current: CurrentChoice) -> _Part:
+def _design_current(source: MachineFile, current: CurrentChoice) -> _Part:
     request, alpha = current.request, current.alpha
     how = f"{request.method}, {alpha / (2.0 * math.pi):.5g} Hz{current.why}"
     values = {}
@@ -172,7 +175,23 @@ def _design_current(current: CurrentChoice) -> _Part:
         facts[f"maximum_delay_{axis}_periods"] = maximum_delay_periods(
             current.gains(axis), plant, plant if request.predictor else None
         )
-    return _Part(values, current.loops(), facts, ())
+    return _Part(values, current.loops(), facts, tuple(_eddy_notes(source, alpha)))
+
+
+def _eddy_notes(source: MachineFile, alpha: float) -> Iterator[str]:
+    """Yield what identified eddy currents hide of L at the current loops' bandwidth, iron loss among them.
+
+    The file's L with the branch e/(L (1 + s tau)) across its flux, e = ``eddy_*_s``, has the impedance
+    s L/(1 + s e/(1 + s tau)); its imaginary part is what the loops see as an inductance.
+    """
+    for axis in "dq":
+        e_s, tau_s = (float(source.conditions.get(f"eddy_{axis}_{key}") or 0.0) for key in ("s", "time_s"))
+        hidden = 1.0 - (1.0 / (1.0 + 1j * alpha * e_s / (1.0 + 1j * alpha * tau_s))).real
+        if hidden >= EDDY_NOTED:
+            yield (
+                f"L_{axis}_h is that of slow changes: at the {alpha / (2.0 * math.pi):.4g} Hz of the current loops "
+                f"eddy currents or iron loss hide {100.0 * hidden:.2g} % of it"
+            )
 
 
 def _weakening_mode(source: MachineFile, request: TuneRequest) -> str:

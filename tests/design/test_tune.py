@@ -177,6 +177,18 @@ def test_a_rotor_that_turns_far_in_a_period_gets_the_predictor(
     assert not int(tune(source, replace(request, predictor=False))["current.options"]) & 16
 
 
+def test_what_eddy_currents_hide_of_an_inductance_is_told_at_the_loops_frequency() -> None:
+    """Of the circuit L parallel to a branch L_e + R_e, by its complex impedance."""
+    L, tau, share = SURFACE.machine.L_d_h, 1e-4, 0.2
+    source = replace(SURFACE, conditions={"eddy_d_s": share * tau, "eddy_d_time_s": tau})
+    design = tune(source)
+    (note,) = [note for note in design.notes if "eddy currents" in note]
+    w = float(design.facts["current_bandwidth_rad_s"])
+    Z = 1.0 / (1.0 / (1j * w * L) + 1.0 / (L / (share * tau) + 1j * w * L / share))
+    assert note.startswith("L_d_h") and f"hide {100.0 * (1.0 - Z.imag / (w * L)):.2g} %" in note
+    assert not any("eddy currents" in note for note in tune(SURFACE).notes)
+
+
 def test_without_inertia_the_speed_loop_is_off_and_said_so() -> None:
     design = tune(replace(SURFACE, machine=replace(SURFACE.machine, J_kgm2=None)))
     assert design["speed.K_p_nms_per_rad"] == design["speed.K_i_nm_per_rad"] == 0.0
