@@ -75,8 +75,8 @@ CHI2_HOPELESS = 100.0
 LINK_SHARE, LINK_SHARE_STD = 0.75, 0.25
 """Share of the inverter's error that is in proportion to the DC link, and its standard deviation: dead time and edges
 are, thresholds are not. A supply of 10 ohm fell by 11 % at the largest level of jercic-2017, and R was 28 % too low."""
-LINK_TOLD = 0.01
-"""Fall of the link (relative) from which on the share that was assumed is told: below, it moves R by less than 3 %."""
+LINK_TOLD, LINK_DEGREE = 0.01, 3
+"""Fall of the link from which on that is told: below, it moves R by less than 3 %; and its degree in the power."""
 MODEL_FLOOR = 2e-4
 """Largest model error of every level, of R I_r: the deliberate one of docs/identification.md, 3.1."""
 MODEL_FLOOR_LEAST = 1.2e-4
@@ -333,11 +333,12 @@ def _hidden_in_knee(
 
 
 def _link_fall(levels: Trace, i: Array, error_v: Array, noise_v: float) -> Array:
-    """Return by how much the DC link stands below its highest at each level (relative, negative).
+    """Return by how much the DC link stands below its highest at each level, by its power (relative, negative).
 
-    0 where it is not recorded, or moves the inverter's error by less than the noise of a level.
+    0 where it is not recorded, or moves the error by less than the noise. Ripple of its means would hide that it falls.
     """
-    U_dc = levels.signals.get("U_dc_v", np.ones_like(i))
+    power_w = levels["u_d_v"] * i
+    U_dc = np.polyval(np.polyfit(power_w, levels.signals.get("U_dc_v", np.ones_like(i)), LINK_DEGREE), power_w)
     fall = np.asarray(U_dc / np.max(U_dc) - 1.0)
     return fall if np.ptp(fall) * np.max(np.abs(error_v)) > noise_v else np.zeros_like(i)
 
