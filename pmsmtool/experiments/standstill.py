@@ -328,7 +328,7 @@ def hold_pairs(
     half : int or None
         Control periods of half a window; None: whole periods of a link's ripple.
     """
-    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad")
+    names = ("i_a_a", "i_b_a", "i_c_a", "u_d_v", "i_d_a", "i_q_a", "theta_m_rad", "T_winding_c")
     half = half or half_window(PERIODS, drive.period_s)
     rows: list[dict[str, float]] = []
     times: list[float] = []

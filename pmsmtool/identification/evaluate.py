@@ -58,7 +58,7 @@ from pmsmtool.identification.mechanics import (
     unseen_above_hz,
     with_play_told,
 )
-from pmsmtool.identification.phase_check import PairCheck, check_pairs, check_phases, over_phases
+from pmsmtool.identification.phase_check import PairCheck, at_one_temperature, check_pairs, check_phases, over_phases
 from pmsmtool.identification.sampling import resistance_as_sampled
 from pmsmtool.identification.wiring import Finding, link_at_rest, supply_power, supply_under_load
 from pmsmtool.machine.parameters import Estimate
@@ -297,7 +297,8 @@ def evaluate(
             R = replace(R, R_s=widened(R.R_s, mismatch), R_measured=widened(R.R_measured, mismatch))
             result = replace(result, resistance=R)
     if "phase_pairs" in traces and result.resistance is not None:
-        pairs = check_pairs(traces["phase_pairs"], result.noise, result.resistance.curve)
+        alike = at_one_temperature(traces["phase_pairs"], result.resistance)
+        pairs = check_pairs(alike, result.noise, result.resistance.curve)
         result = replace(result, pairs=pairs, resistance=over_phases(result.resistance, pairs, tolerance))
     if "rotation_backward" in traces:
         turns = traces["rotation_forward"], traces["rotation_backward"]

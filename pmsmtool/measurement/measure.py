@@ -43,7 +43,7 @@ from pmsmtool.experiments.frequency_response import FrequencyPlan
 from pmsmtool.experiments.mechanics_run import MechanicsPlan
 from pmsmtool.experiments.rotation import turn_vector
 from pmsmtool.identification.evaluate import Evaluation, evaluate, flux_of, inductance_of, resistance_of, tolerance_on
-from pmsmtool.identification.phase_check import PhaseCheck, check_pairs, check_phases
+from pmsmtool.identification.phase_check import PhaseCheck, at_one_temperature, check_pairs, check_phases
 from pmsmtool.identification.prediction import Prediction, check_prediction, line_of, predict
 from pmsmtool.identification.request import COUNTS, LEFT_OUT, entry, steps_of
 from pmsmtool.identification.value_verdict import BEND_NOTED
@@ -531,7 +531,7 @@ class Measurement:
         half = int(self._kept["levels"].meta["samples"]) // 2 if quick else None
         pairs = standstill.hold_pairs(self.drive, currents, turn_a, start, turn_s, quick=quick, half=half)
         self._keep_for_later("phase_pairs", pairs)
-        check_pairs(pairs, noise, resistance.curve)
+        check_pairs(at_one_temperature(pairs, resistance), noise, resistance.curve)
         return start + (2.0 * standstill.PAIR_STEP_RAD if quick else standstill.PHASE_ANGLES_RAD[-1])
 
     def _encoder(self, start_rad: float) -> EncoderResult:

@@ -25,6 +25,7 @@ from pmsmtool.identification.phase_check import (
     SMALL_LIMIT,
     USUAL_BEYOND,
     PairCheck,
+    at_one_temperature,
     check_pairs,
     check_phases,
     over_phases,
@@ -251,6 +252,20 @@ def test_unequal_phases_give_the_mean_of_them() -> None:
     assert "a 2.06, b 1.98, c 1.96" in mean.R_s.fallback
     alike = over_phases(levels, check_pairs(pairs((2.001, 2.0, 2.0)), NOISE, STEP), SensorTolerance())
     assert alike.R_measured == replace(R, systematic=pytest.approx(0.01, rel=1e-2)) and not alike.R_s.fallback
+
+
+def test_a_winding_that_cools_from_pair_to_pair_has_no_unequal_phases() -> None:
+    """Real drive 216860: the levels warmed it by 15 K, its pairs cooled by 7 K, and R was 1.8 % too low."""
+    R = Estimate(2.0, 1e-3, 0.01, "ohm", T_c=20.0)
+    levels = ResistanceResult(R, R, STEP, 5.0, 0.0, Verdict.PASS)
+    T_c, shown = np.array([24.2, 23.8, 20.0, 19.8, 16.2, 16.0]), pairs((2.0, 2.0, 2.0))
+    warm = 2.0 * levels.copper.alpha_per_k * (T_c - 20.0) * shown["i_d_a"]
+    signals = {**shown.signals, "u_d_v": shown["u_d_v"] + warm}
+    assert any(check_pairs(trace(**signals), NOISE, STEP).beyond_mean_ohm)
+    sensed = at_one_temperature(trace(**signals, T_winding_c=T_c), levels)
+    assert check_pairs(sensed, NOISE, STEP).resistance_ohm == pytest.approx([2.0] * 3, rel=1e-9)
+    unknown = trace(**signals, T_winding_c=np.full(6, math.nan))
+    assert at_one_temperature(unknown, levels) is unknown and at_one_temperature(shown, levels) is shown
 
 
 def test_a_difference_of_phases_that_is_not_sure_is_in_the_interval_of_r() -> None:

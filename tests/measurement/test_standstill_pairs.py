@@ -77,6 +77,7 @@ def test_a_window_waits_until_the_current_is_there(windows: int) -> None:
     rows = hold_pairs(drive, PAIR_A, 1.5, 0.0)  # type: ignore[arg-type]
     assert rows["i_d_a"] == pytest.approx([*PAIR_A] * 3, rel=PAIR_ARRIVED)
     assert drive.taken == 6 * (windows + 1)
+    assert rows["T_winding_c"] == pytest.approx(np.zeros(6))  # as the drive shows it
 
 
 def test_a_current_that_is_there_takes_one_window() -> None:
