@@ -29,7 +29,6 @@ from pmsmtool.design.loops.speed_loop import (
     slowed,
     small_time_constants,
     speed_loop,
-    speed_noise,
     symmetric_optimum,
     symmetric_ratio,
 )
@@ -185,7 +184,7 @@ def _eddy_notes(source: MachineFile, alpha: float) -> Iterator[str]:
     s L/(1 + s e/(1 + s tau)); its imaginary part is what the loops see as an inductance.
     """
     for axis in "dq":
-        e_s, tau_s = (float(source.conditions.get(f"eddy_{axis}_{key}") or 0.0) for key in ("s", "time_s"))
+        e_s, tau_s = source.seen(f"eddy_{axis}_s"), source.seen(f"eddy_{axis}_time_s")
         hidden = 1.0 - (1.0 / (1.0 + 1j * alpha * e_s / (1.0 + 1j * alpha * tau_s))).real
         if hidden >= EDDY_NOTED:
             yield (
@@ -261,9 +260,10 @@ def _design_speed(
         return _Part(values, {}, {}, ("speed control is off: the machine file has no inertia J_kgm2", *notes))
     path = SpeedPath(J, source.machine.B_nms or 0.0, current.loop("q"), decimation, pll, filter_hz, notch)
     gains = _speed_gains(request, path, current.alpha)
-    share, why_quiet = quieter(source, gains.K_p * speed_noise(source, pll, filter_hz), rated.tau_max_nm)
+    rated_rad_s = (source.machine.n_nom_rpm or rated.base_speed_rpm) / RPM_PER_RAD_S
+    share, why_quiet = quieter(source, path, gains.K_p, rated.tau_max_nm, rated_rad_s)
     if share < 1.0 and request.speed_bandwidth_hz is None:
-        gains = _speed_gains(replace(request, speed_bandwidth_hz=share * gains.omega_c / math.tau), path, current.alpha)
+        gains = gains.slower(share)
         notes = (*notes, why_quiet)
     paths = [replace(path, shaft=shaft) for shaft in shafts_of(source)]
     if paths and request.speed_bandwidth_hz is None:

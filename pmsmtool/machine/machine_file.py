@@ -128,6 +128,11 @@ class MachineFile(Summarised):
         ]
         return Summary(f"machine file {self.name}", ("key", "value", "std"), rows)
 
+    def seen(self, condition: str) -> float:
+        """Return a number among the conditions, 0 where there is none."""
+        value = self.conditions.get(condition)
+        return float(value) if isinstance(value, (int, float)) else 0.0
+
     def simulation_settings(self) -> dict[str, Value]:
         """Return every ``[simulation]`` key with the value that holds, defaults and fall-backs filled in."""
         tables = {name: _plain(getattr(self, name)) for name in ("machine", "inverter", "encoder")}

@@ -128,8 +128,7 @@ def draw_machine(
 
 def bend_of(machine: MachineFile) -> float:
     """Return the slope of L_d at its bias, relative (1/A), where no flux map holds it; 0: none was seen."""
-    bend_per_a = machine.conditions.get("L_d_bend_per_a")
-    return bend_per_a if isinstance(bend_per_a, float) and machine.flux_map is None else 0.0
+    return machine.seen("L_d_bend_per_a") if machine.flux_map is None else 0.0
 
 
 def _draw_saturation(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
@@ -154,8 +153,8 @@ def _draw_eddy_currents(setup: Setup, machine: MachineFile, rng: np.random.Gener
     once for both axes. At standstill such a loss is hardly told from a late sample; it brakes, and no more than B says:
     of a traction machine it came out 8 times too large, and drawn drives lost their current control.
     """
-    sizes_s = [machine.conditions.get(f"eddy_{axis}_s", 0.0) for axis in "dq"]
-    taus_s = [tau for axis in "dq" if isinstance(tau := machine.conditions.get(f"eddy_{axis}_time_s"), float)]
+    sizes_s = [machine.seen(f"eddy_{axis}_s") for axis in "dq"]
+    taus_s = [tau_s for axis in "dq" if (tau_s := machine.seen(f"eddy_{axis}_time_s"))]
     if not taus_s:
         return
     out, T_s = setup.machine, machine.inverter.T_s
@@ -245,19 +244,17 @@ def _draw_elastic_shaft(setup: Setup, machine: MachineFile, rng: np.random.Gener
 
 def _draw_shaft_effects(setup: Setup, machine: MachineFile, rng: np.random.Generator) -> None:
     """Draw what was identified along the shaft: drag, largest order of the cogging, errors and noise of the encoder."""
-    out, seen = setup.machine, machine.conditions
-    if isinstance(lines := seen.get("encoder_lines"), int):
-        setup.sensors.encoder_lines = float(lines)
+    out, sensors = setup.machine, setup.sensors
+    sensors.encoder_lines = machine.seen("encoder_lines") or sensors.encoder_lines
     for name in ("encoder_once", "encoder_twice", "encoder_line", "encoder_line_twice"):
-        if isinstance(error_rad := seen.get(f"{name}_rad"), float):
-            setattr(setup.sensors, name, float(rng.uniform(*SEEN_SHARES)) * error_rad)
-    if isinstance(noise_rad := seen.get("encoder_noise_rad"), float):
-        setup.sensors.encoder_noise = noise_rad
-    if isinstance(drag := seen.get("drag_nms2"), float):
+        if error_rad := machine.seen(f"{name}_rad"):
+            setattr(sensors, name, float(rng.uniform(*SEEN_SHARES)) * error_rad)
+    sensors.encoder_noise = machine.seen("encoder_noise_rad") or sensors.encoder_noise
+    if drag := machine.seen("drag_nms2"):
         out.drag = float(rng.uniform(*SEEN_SHARES)) * drag
-    torque_nm, periods = seen.get("cogging_nm"), seen.get("cogging_periods")
-    if isinstance(torque_nm, float) and isinstance(periods, int):
-        out.cogging, out.cogging_periods = float(rng.uniform(*SEEN_SHARES)) * torque_nm, float(periods)
+    torque_nm, periods = machine.seen("cogging_nm"), machine.seen("cogging_periods")
+    if torque_nm and periods:
+        out.cogging, out.cogging_periods = float(rng.uniform(*SEEN_SHARES)) * torque_nm, periods
 
 
 def with_fine_cogging(setup: Setup, machine: MachineFile, share: float) -> None:
