@@ -17,6 +17,8 @@ import math
 from typing import TYPE_CHECKING
 
 from pmsmtool.estimators.estimate import COVERAGE_FACTOR, total_half_width
+from pmsmtool.estimators.flux.linkage import FluxResult
+from pmsmtool.estimators.injection.inductance import InductanceResult
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import iron_drag
 from pmsmtool.units import format_estimate, format_quantity
@@ -46,7 +48,7 @@ def iron_loss_of(result: Evaluation) -> Estimate | None:
     if inductance is None or flux is None or flux.shown is None or resistance is None or inductance.sampling:
         return None
     ahead_s = -flux.shown.value_s
-    L_q = min((inductance.L_q, flux.L_q_app), key=lambda estimate: estimate.std)
+    L_q = best_L_q(inductance, flux)
     branches = [
         fit.L_h / fit.eddy_s - resistance.R_measured.value for fit in inductance.axes.values() if fit.eddy_s > 0.0
     ]
@@ -63,6 +65,11 @@ def iron_loss_of(result: Evaluation) -> Estimate | None:
         value, half / COVERAGE_FACTOR, value * L_q.systematic / L_q.value, "ohm", T_c=flux.psi_measured.T_c,
         method="d voltage of a coasting machine, with the branch of the square waves",
     )  # fmt: skip
+
+
+def best_L_q(inductance: InductanceResult, flux: FluxResult) -> Estimate:
+    """Return L_q of the square waves or of the run over speeds, whichever is known better."""
+    return min((inductance.L_q, flux.L_q_app), key=lambda estimate: estimate.std)
 
 
 def least_ohm(result: Evaluation) -> float:

@@ -22,6 +22,7 @@ from pmsmtool.estimators.injection.sampling_instant import Sampling, standstill_
 from pmsmtool.estimators.inverter_error import Modulation
 from pmsmtool.estimators.shaft.disturbances import TILT_FLOOR
 from pmsmtool.estimators.shaft.mechanics import POWERED, MechanicsResult, Torque, estimate_mechanics, mean_mechanics
+from pmsmtool.identification.iron_loss import best_L_q, iron_loss_of
 from pmsmtool.identification.swing import NEAR, swing_of
 from pmsmtool.machine.parameters import Estimate
 from pmsmtool.machine.torque import air_gap_torque, torque_per_ampere
@@ -55,6 +56,9 @@ SAMPLE_DOUBT = 0.2
 drives with a switched inverter 0.02 to 0.5 % of J went down to at most 0.03 % with it."""
 HARMONIC_DOUBT = 0.25
 """Relative standard deviation of the torque that harmonics of the back-EMF take."""
+IRON_DOUBT = 0.1
+"""The same of the reluctance torque that iron loss takes: R_fe, and L_q where a push saturates it, which is 9 % less on
+a ferrite machine."""
 HARMONIC_PARTS, HARMONIC_DEGREE, HARMONIC_SLOWEST = 8, 3, 0.2
 """Parts of a push, degree of the polynomial of time that the currents of one follow without harmonics, and the speed of
 one, of the largest, below which it is not looked at: there the current's step is."""
@@ -155,7 +159,8 @@ def pushes_of(
     if found is not None and result.resistance is not None:  # what a slope leaves of a current that fades in a period
         faded = 0.5 * period_s * result.resistance.R_measured.value / min(L_h)
         doubt = min(1.0, math.hypot(SAMPLE_DOUBT, faded))
-    displaced, tilt, drag, taken = 0.0, 0.0, 0.0, 0.0
+    iron = iron_loss_of(result)
+    displaced, tilt, drag, taken, lost = 0.0, 0.0, 0.0, 0.0, 0.0
     for k, part in enumerate(parts):
         if not part.meta["coasting"] or part.meta.get(POWERED):
             sampled = in_frame(part, behind)
@@ -170,7 +175,13 @@ def pushes_of(
             displaced = max(displaced, abs(float(np.mean(after - before))) / size)
             eddy = _eddy_share(part, pole_pairs, result)
             by_harmonics = _harmonic_current(part, direction, pole_pairs, result)
-            parts[k] = replace(parts[k], signals={**parts[k].signals, "i_q_a": parts[k]["i_q_a"] - by_harmonics})
+            i_d, i_q = parts[k]["i_d_a"], parts[k]["i_q_a"] - by_harmonics
+            if iron is not None and found is not None:
+                # the flux of i_q drives a d current through the iron; that through the magnets' flux is in B
+                driven = direction * pole_pairs * _speed(part) * best_L_q(found, result.flux).value / iron.value * i_q
+                by_iron = float(np.mean(np.abs(torque(i_d + driven, i_q) - torque(i_d, i_q)))) / size
+                i_d, lost = i_d + driven, max(lost, by_iron)
+            parts[k] = replace(parts[k], signals={**parts[k].signals, "i_d_a": i_d, "i_q_a": i_q})
             taken = max(taken, float(np.mean(np.abs(by_harmonics))) / float(np.mean(np.abs(part["i_q_a"]))))
             tilt = max(tilt, math.hypot(doubt * float(np.mean((after - before)[fast])) / size, eddy))
     return Pushes(
@@ -179,7 +190,9 @@ def pushes_of(
         torque_per_ampere(pole_pairs, psi.value),
         result.noise.sigma_a,
         torque_doubt(
-            result.flux, math.hypot(doubt * displaced, HARMONIC_DOUBT * taken), mapped=result.flux_map is not None
+            result.flux,
+            math.hypot(doubt * displaced, HARMONIC_DOUBT * taken, IRON_DOUBT * lost),
+            mapped=result.flux_map is not None,
         ),
         math.hypot(TILT_FLOOR, tilt),
         direction,
@@ -404,7 +417,11 @@ def in_frame(trace: Trace, behind_rad: float) -> Trace:
 
 
 def torque_of(result: Evaluation, pole_pairs: int) -> Torque:
-    """Torque by the flux map where there is one, else by flux linkage and the difference of the inductances."""
+    """Torque by the flux map where there is one, else by flux linkage and the difference of the inductances.
+
+    Beside iron loss in a ferrite machine of 13 and 65 mH the square waves had 15 mH +-700 % on q, and J with it was
+    9.6 % off at +-2.3 %.
+    """
     assert result.flux is not None
     psi = result.flux.psi_measured.value
     if result.flux_map is not None:
@@ -417,5 +434,7 @@ def torque_of(result: Evaluation, pole_pairs: int) -> Torque:
 
         return by_map
     found = result.inductance
-    difference = 0.0 if found is None else found.L_d.value - found.L_q.value
+    difference = 0.0
+    if found is not None:
+        difference = found.L_d.value - best_L_q(found, result.flux).value
     return lambda i_d, i_q: torque_per_ampere(pole_pairs, psi + difference * i_d) * i_q
